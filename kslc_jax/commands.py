@@ -1,0 +1,68 @@
+"""Commanded velocity and heading of one environment."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from kslc_jax import maths
+from kslc_jax.config import CommandConfig
+
+TURNING = 0.1
+"""Commanded yaw rate [rad/s] below which a robot with zero velocity command may stand still."""
+
+
+@flax.struct.dataclass
+class Command:
+    """What the robot is asked to do."""
+
+    velocity: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s], base frame
+    heading: jax.Array  # [] rad, world
+    moving: jax.Array  # [] bool: False asks to stand still (clock stopped, both feet down)
+
+
+def sample(
+    config: CommandConfig, key: jax.Array, vx_range: tuple[jax.Array, jax.Array], yaw: jax.Array
+) -> Command:
+    """Draws a command for a robot that now heads to `yaw` [rad]; vx is uniform in `vx_range`.
+
+    Fast commands come with small side steps and turns: with `narrow_speed` both shrink linearly.
+    """
+    keys = jax.random.split(key, 4)
+    vx = jax.random.uniform(keys[0], minval=vx_range[0], maxval=vx_range[1])
+    vy = jax.random.uniform(keys[1], minval=config.vy[0], maxval=config.vy[1])
+    heading = jax.random.uniform(keys[2], minval=config.heading[0], maxval=config.heading[1])
+    if config.narrow_speed > 0:
+        share = jnp.clip(1.0 - jnp.abs(vx) / config.narrow_speed, 0.0, 1.0)
+        vy = vy * share
+        heading = yaw + share * maths.wrap_angle(heading - yaw)
+
+    kind = jax.random.uniform(keys[3])
+    stand = kind < config.stand_fraction
+    forward = kind < config.stand_fraction + config.forward_fraction
+    vx = jnp.where(stand, 0.0, vx)
+    vy = jnp.where(forward, 0.0, vy)
+    heading = jnp.where(stand, yaw, heading)
+    alive = jnp.hypot(vx, vy) > config.dead_zone
+    velocity = jnp.stack([vx, vy, jnp.zeros(())]) * alive
+    return steer(config, Command(velocity, heading, alive), yaw)
+
+
+def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:
+    """Recomputes the commanded yaw rate from the heading error, every step (HG)."""
+    error = maths.wrap_angle(command.heading - yaw)
+    rate = jnp.clip(config.heading_gain * error, -config.max_yaw_rate, config.max_yaw_rate)
+    return with_velocity(config, command, command.velocity.at[2].set(rate))
+
+
+def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) -> Command:
+    """The command with `velocity` [3]; decides whether that means standing still."""
+    walks = jnp.any(velocity[:2] != 0.0)
+    if not config.stand_still:
+        return command.replace(velocity=velocity, moving=jnp.ones((), bool))
+    moving = walks | (jnp.abs(velocity[2]) > TURNING)
+    return command.replace(velocity=jnp.where(moving, velocity, 0.0), moving=moving)
+
+
+def speed_share(command: Command, v_max: jax.Array) -> jax.Array:
+    """The paper's g = v_cmd / v_max (Eq. 6), of the forward speed, in [0, 1]."""
+    return jnp.clip(jnp.abs(command.velocity[0]) / v_max, 0.0, 1.0)

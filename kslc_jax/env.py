@@ -1,0 +1,228 @@
+"""The environment: `reset` and `step` for ONE robot, pure functions; the caller vmaps and jits.
+
+`step` is the one place that says in which order things happen in a control step. A reset draws
+every field anew: nothing of an episode reaches the next one.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from kslc_jax import commands, gait, maths, observations, physics, randomize, rewards, signals
+from kslc_jax import curriculum as curriculum_lib
+from kslc_jax.commands import Command
+from kslc_jax.config import NUM_JOINTS, Config
+from kslc_jax.curriculum import Curriculum
+from kslc_jax.gait import GaitState
+from kslc_jax.physics import PhysicsState
+from kslc_jax.randomize import Dynamics
+from kslc_jax.signals import Signals
+
+
+@flax.struct.dataclass
+class EnvState:
+    """Everything one environment remembers."""
+
+    physics: PhysicsState
+    dynamics: Dynamics
+    gait: GaitState
+    command: Command
+    history: jax.Array  # [K, 59] actor frames, oldest first
+    privileged_history: jax.Array  # [Kp, 89] critic frames
+    last_action: jax.Array  # [16] as applied
+    last_last_action: jax.Array  # [16]
+    last_base_velocity: jax.Array  # [6] world
+    push: jax.Array  # [5] the last push: m/s (x, y), rad/s (3)
+    time: jax.Array  # [] int, control steps since the reset
+
+
+@flax.struct.dataclass
+class Outcome:
+    """What one step gives beside the next state. `terminated` and `truncated` exclude each other."""
+
+    reward: jax.Array  # []
+    terminated: jax.Array  # [] bool: fell, or the physics went non-finite
+    truncated: jax.Array  # [] bool: time limit
+    broken: jax.Array  # [] bool: non-finite physics; its sample is not to be learnt from
+    terms: dict[str, jax.Array]  # raw reward terms, see rewards.TERMS
+    tracking: jax.Array  # [] tracking_lin_vel, share of its maximum
+    fast: jax.Array  # [] bool: the command was in the top part of the range
+    episode_steps: jax.Array  # [] int, length of the episode so far
+    speeding: jax.Array  # [] bool: some joint is over its speed limit
+
+
+def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
+    """A fresh episode."""
+    keys = jax.random.split(key, 5)
+    robot = physics.robot_for(config.physics)
+    noise = config.env.reset_joint_noise
+    joints = jax.random.uniform(keys[0], (NUM_JOINTS,), minval=-noise, maxval=noise)
+    qpos = jnp.asarray(robot.default_qpos, jnp.float32).at[7:].add(joints)
+    state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
+    now = signals.read(robot, state)
+    command = _sample_command(config, keys[1], curriculum, now)
+    blank = EnvState(
+        physics=state,
+        dynamics=randomize.sample(config.randomize, keys[2]),
+        gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
+        command=command,
+        history=jnp.zeros((config.env.frames, observations.ACTOR_WIDTH)),
+        privileged_history=jnp.zeros((config.env.privileged_frames, observations.CRITIC_WIDTH)),
+        last_action=jnp.zeros(NUM_JOINTS),
+        last_last_action=jnp.zeros(NUM_JOINTS),
+        last_base_velocity=jnp.zeros(6),
+        push=jnp.zeros(5),
+        time=jnp.zeros((), jnp.int32),
+    )
+    return _observe(config, blank, now, keys[4])
+
+
+def step(
+    config: Config, state: EnvState, action: jax.Array, key: jax.Array, curriculum: Curriculum
+) -> tuple[EnvState, Outcome]:
+    """Advances one environment by one control step; starts a new episode where one ended.
+
+    Args:
+      config: static.
+      state: the environment before the step.
+      action: [16] in joint order, unscaled.
+      key: used for everything random in this step.
+      curriculum: command range and gait cycle in force.
+
+    Returns:
+      The state to act from next (already reset if the episode ended), and the step's outcome.
+    """
+    keys = jax.random.split(key, 5)
+    robot = physics.robot_for(config.physics)
+
+    action = _applied_action(config, action, state.last_action, keys[0])
+    target = jnp.asarray(robot.default_qpos[7:], jnp.float32) + config.env.action_scale * action
+    new = physics.step(
+        config.physics, state.physics, target, state.dynamics, config.randomize.ground_friction
+    )
+    broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)))
+    new = maths.tree_where(broken, state.physics, new)
+    now = signals.read(robot, new)
+
+    command = commands.steer(config.command, state.command, now.base_euler[2])
+    cycle = gait.cycle_time(config.gait, command, curriculum.cycle_time, curriculum.v_max)
+    gait_now = gait.update(config.gait, state.gait, now, command, cycle, config.control_dt)
+
+    time = state.time + 1
+    terminated = now.torso_contact | broken
+    truncated = (time >= config.episode_steps) & ~terminated
+    reward, terms = rewards.evaluate(
+        config.rewards,
+        robot,
+        config.control_dt,
+        rewards.Inputs(
+            signals=now,
+            gait=gait_now,
+            command=command,
+            reference=gait.reference_pose(config.gait, robot, gait_now, command),
+            action=action,
+            last_action=state.last_action,
+            last_last_action=state.last_last_action,
+            last_joint_vel=state.physics.qvel[6:],
+            last_base_velocity=state.last_base_velocity,
+            v_max=curriculum.v_max,
+        ),
+    )
+    outcome = Outcome(
+        reward=jnp.where(broken, 0.0, reward),
+        terminated=terminated,
+        truncated=truncated,
+        broken=broken,
+        terms=terms,
+        tracking=terms["tracking_lin_vel"],
+        fast=curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
+        episode_steps=time,
+        speeding=jnp.any(jnp.abs(now.joint_vel) > robot.speed_limit),
+    )
+    state = state.replace(
+        physics=new,
+        gait=gait_now,
+        command=_resample(config, command, time, keys[1], curriculum, now),
+        last_action=action,
+        last_last_action=state.last_action,
+        last_base_velocity=now.base_velocity,
+        time=time,
+    )
+    state = _push(config, state, keys[2])
+    state = _observe(config, state, signals.read(robot, state.physics), keys[3])
+    fresh = reset(config, keys[4], curriculum)
+    return maths.tree_where(terminated | truncated, fresh, state), outcome
+
+
+def _applied_action(
+    config: Config, action: jax.Array, last_action: jax.Array, key: jax.Array
+) -> jax.Array:
+    """Clipped action after a random delay and multiplicative noise (HG); arms zeroed if held."""
+    key_delay, key_noise = jax.random.split(key)
+    action = jnp.clip(action, -config.env.action_clip, config.env.action_clip)
+    delay = config.env.action_delay * jax.random.uniform(key_delay)
+    action = (1.0 - delay) * action + delay * last_action
+    noise = jax.random.normal(key_noise, action.shape)
+    action = action * (1.0 + config.env.action_noise * noise)
+    if config.env.arms == "held":
+        action = action * ~physics.robot_for(config.physics).is_arm
+    return action
+
+
+def _sample_command(
+    config: Config, key: jax.Array, curriculum: Curriculum, now: Signals
+) -> Command:
+    vx_range = (jnp.asarray(config.curriculum.v_min), curriculum.v_max)
+    return commands.sample(config.command, key, vx_range, now.base_euler[2])
+
+
+def _resample(
+    config: Config,
+    command: Command,
+    time: jax.Array,
+    key: jax.Array,
+    curriculum: Curriculum,
+    now: Signals,
+) -> Command:
+    """A new command every `resample_seconds` of the episode."""
+    period = round(config.command.resample_seconds / config.control_dt)
+    fresh = _sample_command(config, key, curriculum, now)
+    return maths.tree_where(time % period == 0, fresh, command)
+
+
+def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:
+    """Every `push_seconds`: a random change of the base's planar velocity and rotation rate."""
+    r = config.randomize
+    if r.push_seconds <= 0:
+        return state
+    size = jnp.array([r.push_velocity] * 2 + [r.push_angular] * 3)
+    push = size * jax.random.uniform(key, (5,), minval=-1.0, maxval=1.0)
+    keep = 1.0 if r.push_adds else 0.0
+    qvel = state.physics.qvel
+    pushed = qvel.at[:2].set(keep * qvel[:2] + push[:2]).at[3:6].set(keep * qvel[3:6] + push[2:])
+    now = state.time % round(r.push_seconds / config.control_dt) == 0
+    return state.replace(
+        physics=state.physics.replace(qvel=jnp.where(now, pushed, qvel)),
+        push=jnp.where(now, push, state.push),
+    )
+
+
+def _observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> EnvState:
+    """Appends the frames of the present to the histories."""
+    robot = physics.robot_for(config.physics)
+    src = observations.Sources(
+        signals=now,
+        gait=state.gait,
+        command=state.command,
+        dynamics=state.dynamics,
+        reference=gait.reference_pose(config.gait, robot, state.gait, state.command),
+        last_action=state.last_action,
+        push=state.push,
+        base_mass=robot.mj_model.body_mass[robot.base_body_id] + state.dynamics.base_mass,
+    )
+    frame = observations.actor_frame(config.env, src, key)
+    privileged = observations.critic_frame(config.env, src)
+    return state.replace(
+        history=observations.push_history(state.history, frame),
+        privileged_history=observations.push_history(state.privileged_history, privileged),
+    )

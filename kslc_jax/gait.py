@@ -1,0 +1,134 @@
+"""Gait clock, stance mask, reference pose, air time and swing height of one environment."""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kslc_jax.commands import Command, speed_share
+from kslc_jax.config import GaitConfig
+from kslc_jax.robot import Robot
+from kslc_jax.signals import Signals
+
+SOLE_DROP = 0.05
+"""Height of the ankle-roll link above the sole that Humanoid-Gym subtracts [m]."""
+
+# Reference motion per joint of the left side: share of the leg amplitude in swing (HG), of the arm
+# swing, of the elbow bend. Signs follow the joint axes: a negative left leg_pitch and knee swing
+# that leg forward and bend it; a positive left shoulder_pitch swings that arm back. The right side
+# has mirrored axes.
+_LEG = {"leg_pitch": 1.0, "knee": 2.0, "ankle_pitch": 1.0}
+_ARM = {"shoulder_pitch": 1.0}
+_ELBOW = {"elbow_pitch": 1.0}
+
+
+@flax.struct.dataclass
+class GaitState:
+    """Memory of the gait. Feet: left, right."""
+
+    phase: jax.Array  # [] share of the gait cycle, in [0, 1)
+    contact: jax.Array  # [2] bool, foot contact of the last step
+    lift_z: jax.Array  # [2] m, height of the foot at its last contact
+    air_time: jax.Array  # [2] s since the last contact, 0 in contact
+    landing: jax.Array  # [2] s, air time that ended this step, else 0
+    swing_height: jax.Array  # [2] m above the last contact
+    stance: jax.Array  # [2] bool, where the clock wants the feet down
+    clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
+
+
+def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array) -> GaitState:
+    """Gait memory at the start of an episode; `foot_z` [2, m] is where the feet rest."""
+    phase = jax.random.uniform(key) if config.random_phase else jnp.zeros(())
+    clock, stance = _clock(config, phase, command)
+    zeros = jnp.zeros(2)
+    return GaitState(
+        phase=phase,
+        contact=jnp.zeros(2, bool),
+        lift_z=foot_z,
+        air_time=zeros,
+        landing=zeros,
+        swing_height=zeros,
+        stance=stance,
+        clock=clock,
+    )
+
+
+def update(
+    config: GaitConfig,
+    state: GaitState,
+    signals: Signals,
+    command: Command,
+    cycle_time: jax.Array,
+    dt: float,
+) -> GaitState:
+    """Advances the clock by `dt` [s] and books contacts.
+
+    A foot has landed when it, the clock or the step before says 'contact' (HG), and is paid for the
+    air time up to now.
+    """
+    phase = jnp.mod(state.phase + dt / cycle_time, 1.0)
+    clock, stance = _clock(config, phase, command)
+    contact = signals.foot_contact
+    grounded = contact | stance | state.contact
+    flown = state.air_time > 0.0
+    air_time = state.air_time + dt
+    foot_z = signals.foot_pos[:, 2]
+    return GaitState(
+        phase=phase,
+        contact=contact,
+        lift_z=jnp.where(contact, foot_z, state.lift_z),
+        air_time=jnp.where(grounded, 0.0, air_time),
+        landing=jnp.where(flown & grounded, air_time, 0.0),
+        swing_height=foot_z - state.lift_z,
+        stance=stance,
+        clock=clock,
+    )
+
+
+def _clock(
+    config: GaitConfig, phase: jax.Array, command: Command
+) -> tuple[jax.Array, jax.Array]:
+    """sin and cos of the phase [2], and the stance mask [2]."""
+    angle = 2.0 * jnp.pi * phase
+    s = jnp.sin(angle)
+    stance = jnp.stack([s >= 0.0, s < 0.0]) | (jnp.abs(s) < config.double_support)
+    clock = jnp.stack([s, jnp.cos(angle)]) * command.moving
+    return clock, stance | ~command.moving
+
+
+def cycle_time(config: GaitConfig, command: Command, curriculum_cycle, v_max) -> jax.Array:
+    """Seconds per cycle for this command under the curriculum's cycle time and v_max."""
+    if not config.cycle_follows_speed:
+        return curriculum_cycle
+    share = speed_share(command, v_max)
+    return config.cycle_time + share * (curriculum_cycle - config.cycle_time)
+
+
+def reference_pose(
+    config: GaitConfig, robot: Robot, state: GaitState, command: Command
+) -> jax.Array:
+    """Reference joint angles [16, rad] of Humanoid-Gym, with amplitudes that grow with the speed.
+
+    The swing leg follows a half sine; with `arm_swing` the arms follow the cosine, against the leg
+    of their side, and with `elbow_bend` the elbows flex. All zero at their Humanoid-Gym settings
+    but the legs.
+    """
+    share = jnp.clip(jnp.abs(command.velocity[0]) / config.full_speed, 0.0, 1.0)
+    s, c = state.clock
+    swing = jnp.where(jnp.abs(s) < config.double_support, 0.0, s)
+    leg = config.reference_scale * (1.0 + config.reference_speed_gain * share)
+    pose = leg * (
+        _pattern(robot, "left", _LEG) * jnp.minimum(swing, 0.0)
+        + _pattern(robot, "right", _LEG) * jnp.maximum(swing, 0.0)
+    )
+    arms = _pattern(robot, "left", _ARM) + _pattern(robot, "right", _ARM)
+    elbows = _pattern(robot, "left", _ELBOW) - _pattern(robot, "right", _ELBOW)
+    return pose + share * (config.arm_swing * c * arms + config.elbow_bend * elbows)
+
+
+def _pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:
+    """[16] with each named joint's share on one side, zero elsewhere."""
+    values = np.zeros(len(robot.joint_names))
+    for joint, share in shares.items():
+        values[robot.joint_names.index(f"{side}_{joint}_joint")] = share
+    return values

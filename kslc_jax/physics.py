@@ -1,0 +1,256 @@
+"""One control step of the robot: joint targets -> PD torques -> decimated physics -> PhysicsState.
+
+Two engines behind one signature, same model and same numbers within float32:
+
+- ``mjx``: MJX's JAX implementation, pure XLA, any device.
+- ``mujoco``: C MuJoCo's ``mujoco.batch.Batch`` on all CPU cores behind one numpy-only
+  ``jax.pure_callback`` (vmapped environments arrive in it as one batch).
+
+Only qpos, qvel, the solver's warm start and the sensors cross a step: a whole ``mjx.Data`` is 16 KB
+an environment.
+"""
+
+import contextlib
+import functools
+import io
+import threading
+from typing import Any
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.batch
+import numpy as np
+
+with contextlib.redirect_stdout(io.StringIO()):  # mjx prints about an optional backend
+    from mujoco import mjx
+
+from kslc_jax import robot as robot_lib
+from kslc_jax.config import PhysicsConfig
+from kslc_jax.randomize import Dynamics, model_fields
+from kslc_jax.robot import Robot
+
+TORQUE_KNEE = 0.75
+"""Share of a joint's speed limit above which its driving torque falls, linearly, to zero."""
+
+FRICTION_SPEED = 0.2
+"""Joint speed [rad/s] at which Coulomb friction is 76 % grown (tanh keeps it smooth)."""
+
+
+@flax.struct.dataclass
+class PhysicsState:
+    """What the next control step, and every signal, is computed from."""
+
+    qpos: jax.Array  # [23] base position [m], base quaternion (w, x, y, z), joint angles [rad]
+    qvel: jax.Array  # [22] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
+    qacc_warmstart: jax.Array  # [22] contact solver's start
+    sensordata: jax.Array  # [S] named sensors of the model, see Robot.sensor
+    torque: jax.Array  # [16] motor torques of the last physics step [N m]
+
+
+def robot_for(config: PhysicsConfig) -> Robot:
+    """The training-fidelity robot at the config's timestep and solver settings (cached)."""
+    return robot_lib.load(
+        "train",
+        timestep=config.timestep,
+        iterations=config.iterations,
+        ls_iterations=config.ls_iterations,
+    )
+
+
+def resolve_engine(config: PhysicsConfig) -> str:
+    """'mjx' or 'mujoco'; 'auto' takes mjx where JAX has an accelerator."""
+    if config.engine != "auto":
+        return config.engine
+    return "mujoco" if jax.default_backend() == "cpu" else "mjx"
+
+
+def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
+    """PD torque within the motor's limits, minus joint friction [16, N m].
+
+    clip(kp (target - q) - kd dq, lower, upper): in the driving direction the available torque
+    falls from its full value (0.85 x effort limit x strength) at 75 % of the joint's speed limit to
+    zero at the limit; braking keeps all of it. PhysX, which Humanoid-Gym trains in, clamps the
+    joint speed itself.
+
+    Args:
+      robot: gains and limits.
+      dynamics: factors on them, see `Dynamics`.
+      q, dq, target: joint angles [rad], speeds [rad/s], target angles [rad], [..., 16].
+      xp: numpy or jax.numpy; the two engines share this function.
+    """
+    pd = dynamics.kp * robot.kp * (target - q) - dynamics.kd * robot.kd * dq
+    full = robot.effort_limit * dynamics.motor_strength
+    fall = (1.0 - TORQUE_KNEE) * robot.speed_limit
+    upper = full * xp.clip((robot.speed_limit - dq) / fall, 0.0, 1.0)
+    lower = -full * xp.clip((robot.speed_limit + dq) / fall, 0.0, 1.0)
+    return xp.clip(pd, lower, upper) - dynamics.joint_friction * xp.tanh(dq / FRICTION_SPEED)
+
+
+def servo_control(robot: Robot, torque, q, dq):
+    """Control signal that makes the model's position servos give `torque` at (q, dq).
+
+    The servo's force is kp (ctrl - q) - kd dq; solved for ctrl. Its kd stays in the integrator's
+    implicit part, without which the 0.011 kg m^2 foot is unstable at 5 ms.
+    """
+    return q + (torque + robot.kd * dq) / robot.kp
+
+
+def initial_state(config: PhysicsConfig, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
+    """State before any step; sensors hold the home pose's values until the first step."""
+    model = robot_for(config).mj_model
+    return PhysicsState(
+        qpos=qpos,
+        qvel=qvel,
+        qacc_warmstart=jnp.zeros(model.nv),
+        sensordata=jnp.asarray(_home_sensordata(config), jnp.float32),
+        torque=jnp.zeros(model.nu),
+    )
+
+
+def step(
+    config: PhysicsConfig,
+    state: PhysicsState,
+    target: jax.Array,
+    dynamics: Dynamics,
+    ground_friction: float,
+) -> PhysicsState:
+    """Advances one environment by one control step towards the joint targets [16, rad]."""
+    fields = model_fields(robot_for(config), dynamics, ground_friction)
+    engine = _step_mujoco if resolve_engine(config) == "mujoco" else _step_mjx
+    return engine(config, state, target, dynamics, fields)
+
+
+@functools.lru_cache(maxsize=8)
+def _home_sensordata(config: PhysicsConfig) -> np.ndarray:
+    robot = robot_for(config)
+    data = mujoco.MjData(robot.mj_model)
+    data.qpos[:] = robot.default_qpos
+    mujoco.mj_forward(robot.mj_model, data)
+    values = data.sensordata.copy()
+    for name in ("left_foot_touch", "right_foot_touch"):
+        values[robot.sensor(name)] = 0.0
+    return values
+
+
+# ----------------------------------------------------------------------------------------- mjx
+
+
+@functools.lru_cache(maxsize=8)
+def _mjx_model(config: PhysicsConfig) -> mjx.Model:
+    with jax.ensure_compile_time_eval():
+        return mjx.put_model(robot_for(config).mj_model, impl="jax")
+
+
+def _step_mjx(
+    config: PhysicsConfig,
+    state: PhysicsState,
+    target: jax.Array,
+    dynamics: Dynamics,
+    fields: dict[str, jax.Array],
+) -> PhysicsState:
+    robot = robot_for(config)
+    model = _mjx_model(config).replace(**fields)
+    data = mjx.make_data(robot.mj_model, impl="jax").replace(
+        qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
+    )
+
+    def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
+        q, dq = data.qpos[7:], data.qvel[6:]
+        torque = motor_torque(robot, dynamics, q, dq, target)
+        data = data.replace(ctrl=servo_control(robot, torque, q, dq))
+        return mjx.step(model, data), torque
+
+    with jax.default_matmul_precision("highest"):
+        data, torques = jax.lax.scan(substep, data, None, length=config.decimation)
+        data = _refresh_sensors(model, data)
+    return PhysicsState(
+        qpos=data.qpos,
+        qvel=data.qvel,
+        qacc_warmstart=data.qacc_warmstart,
+        sensordata=data.sensordata,
+        torque=torques[-1],
+    )
+
+
+def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Position and velocity sensors at the new state; contact sensors stay the last step's."""
+    from mujoco.mjx._src import sensor  # not exported; no public way to run the sensors alone
+
+    data = mjx.com_pos(model, mjx.kinematics(model, data))
+    data = mjx.com_vel(model, data)
+    return sensor.sensor_vel(model, sensor.sensor_pos(model, data))
+
+
+# -------------------------------------------------------------------------------------- mujoco
+
+_batches: dict[tuple[int, int, int], mujoco.batch.Batch] = {}
+_batches_lock = threading.Lock()
+
+
+def _batch(robot: Robot, size: int, threads: int, fields: tuple[str, ...]) -> mujoco.batch.Batch:
+    """The cached simulator batch of this size; its state is overwritten at every call."""
+    key = (id(robot), size, threads)
+    if key not in _batches:
+        batch = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
+        for name in fields:
+            batch.expand(name)
+        _batches[key] = batch
+    return _batches[key]
+
+
+def _step_mujoco(
+    config: PhysicsConfig,
+    state: PhysicsState,
+    target: jax.Array,
+    dynamics: Dynamics,
+    fields: dict[str, jax.Array],
+) -> PhysicsState:
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+    return jax.pure_callback(
+        functools.partial(_host_step, config),
+        like,
+        state,
+        target,
+        dynamics,
+        fields,
+        vmap_method="broadcast_all",
+    )
+
+
+def _host_step(
+    config: PhysicsConfig,
+    state: PhysicsState,
+    target: np.ndarray,
+    dynamics: Dynamics,
+    fields: dict[str, np.ndarray],
+) -> PhysicsState:
+    """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us."""
+    lead = np.shape(target)[:-1]
+    robot = robot_for(config)
+
+    def rows(x: Any) -> np.ndarray:
+        x = np.asarray(x, np.float64)
+        return x.reshape(-1, *x.shape[len(lead) :])
+
+    state, dynamics, fields = jax.tree.map(rows, (state, dynamics, fields))
+    target = rows(target)
+    with _batches_lock:
+        batch = _batch(robot, len(target), config.threads, tuple(fields))
+        for name, value in fields.items():
+            batch.expand(name)[:] = value
+        qpos, qvel, warmstart = (batch.bind(n) for n in ("qpos", "qvel", "qacc_warmstart"))
+        sensordata, ctrl = batch.bind("sensordata"), batch.bind("ctrl")
+        qpos[:], qvel[:], warmstart[:] = state.qpos, state.qvel, state.qacc_warmstart
+        torque = state.torque
+        for i in range(config.decimation):
+            q, dq = qpos[:, 7:], qvel[:, 6:]
+            torque = motor_torque(robot, dynamics, q, dq, target, np)
+            ctrl[:] = servo_control(robot, torque, q, dq)
+            last = i == config.decimation - 1
+            batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
+        new = PhysicsState(qpos, qvel, warmstart, sensordata, torque)  # type: ignore[arg-type]
+        return jax.tree.map(
+            lambda x: np.array(x, np.float32).reshape(*lead, *x.shape[1:]), new
+        )

@@ -1,0 +1,180 @@
+"""PPO with a KL-adaptive learning rate. Knows no environment: arrays in, a new Learner out."""
+
+from collections.abc import Callable
+
+import chex
+import flax.struct
+import jax
+import jax.numpy as jnp
+import optax
+
+from kslc_jax.config import PPOConfig
+from kslc_jax.networks import Gaussian, Params
+
+
+@flax.struct.dataclass
+class Learner:
+    """Everything an update changes."""
+
+    params: Params
+    opt_state: optax.OptState
+    learning_rate: jax.Array  # []
+
+
+@flax.struct.dataclass
+class Samples:
+    """What PPO needs of each step of a rollout, [T, N, ...] or any leading axes."""
+
+    index: jax.Array  # [] int, names the observation for `Apply`
+    action: jax.Array  # [16]
+    mean: jax.Array  # [16] of the policy that acted
+    log_prob: jax.Array  # [] of the action under it
+    value: jax.Array  # []
+    advantage: jax.Array  # []
+    target: jax.Array  # [] value target
+    valid: jax.Array  # [] bool, False: not to be learnt from
+
+
+Apply = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array]]
+"""(params, indices [B]) -> (action distribution, values [B]) at those observations."""
+
+
+def optimizer(config: PPOConfig) -> optax.GradientTransformation:
+    """Adam on clipped gradients; the learning rate is applied outside, it adapts."""
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam())
+
+
+def init(config: PPOConfig, params: Params) -> Learner:
+    """Learner before the first update."""
+    rate = jnp.asarray(config.learning_rate, jnp.float32)
+    return Learner(params, optimizer(config).init(params), rate)
+
+
+def gae(
+    reward: jax.Array,
+    value: jax.Array,
+    last_value: jax.Array,
+    done: jax.Array,
+    truncated: jax.Array,
+    gamma: float,
+    lam: float,
+) -> tuple[jax.Array, jax.Array]:
+    """Generalised advantage estimation for ONE environment (Schulman et al. 2016).
+
+    delta_t = r_t + gamma V_{t+1} (1 - done_t) - V_t;  A_t = delta_t + gamma lam (1 - done_t) A_{t+1}.
+    A time-out is not a failure: there r_t gains gamma V_t in place of the value it was cut from
+    (Humanoid-Gym; the state after the cut is gone).
+
+    Args:
+      reward, value, done, truncated: [T]; `done` is terminated or truncated.
+      last_value: [] V_T.
+      gamma, lam: discount and GAE factor.
+
+    Returns:
+      (advantage [T], value target [T]).
+    """
+    chex.assert_equal_shape([reward, value, done, truncated])
+    reward = reward + gamma * value * truncated
+    going = 1.0 - done.astype(value.dtype)
+    next_value = jnp.append(value[1:], last_value)
+    delta = reward + gamma * next_value * going - value
+
+    def back(carry: jax.Array, x: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        delta_t, going_t = x
+        advantage = delta_t + gamma * lam * going_t * carry
+        return advantage, advantage
+
+    _, advantage = jax.lax.scan(back, jnp.zeros_like(last_value), (delta, going), reverse=True)
+    return advantage, advantage + value
+
+
+def loss(
+    config: PPOConfig, apply: Apply, log_std: jax.Array, params: Params, batch: Samples
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Clipped surrogate + clipped value loss - entropy bonus, over the valid samples of `batch`.
+
+    `log_std` [16] is the deviation that the batch was sampled with.
+    """
+    dist, value = apply(params, batch.index)
+    weight = batch.valid / jnp.maximum(jnp.sum(batch.valid), 1)
+
+    def mean(x: jax.Array) -> jax.Array:
+        return jnp.sum(x * weight)
+
+    ratio = jnp.exp(dist.log_prob(batch.action) - batch.log_prob)
+    clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+    policy_loss = -mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+
+    near = batch.value + jnp.clip(value - batch.value, -config.clip, config.clip)
+    errors = jnp.maximum(jnp.square(value - batch.target), jnp.square(near - batch.target))
+    value_loss = mean(errors)
+
+    entropy = dist.entropy()
+    total = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+    info = {
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "entropy": entropy,
+        "kl": mean(dist.kl_from(Gaussian(batch.mean, log_std))),
+        "clip_share": mean(jnp.abs(ratio - 1.0) > config.clip),
+    }
+    return total, info
+
+
+def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
+    """Divides the rate where KL > 2 desired, multiplies it where KL < desired / 2, within bounds."""
+    rate = jnp.where(kl > 2.0 * config.desired_kl, rate / config.learning_rate_factor, rate)
+    slow = (kl > 0.0) & (kl < 0.5 * config.desired_kl)
+    rate = jnp.where(slow, rate * config.learning_rate_factor, rate)
+    return jnp.clip(rate, *config.learning_rate_bounds)
+
+
+def gradient_step(
+    config: PPOConfig, apply: Apply, log_std: jax.Array, learner: Learner, batch: Samples
+) -> tuple[Learner, dict[str, jax.Array]]:
+    """One minibatch. A non-finite gradient changes nothing and is counted in `skipped`."""
+    grads, info = jax.grad(loss, argnums=3, has_aux=True)(
+        config, apply, log_std, learner.params, batch
+    )
+    grad_norm = optax.tree.norm(grads)
+    rate = adapt_learning_rate(config, learner.learning_rate, info["kl"])
+    updates, opt_state = optimizer(config).update(grads, learner.opt_state)
+    params = jax.tree.map(lambda p, u: p - rate * u, learner.params, updates)
+    finite = jnp.isfinite(grad_norm)
+    new = Learner(params, opt_state, rate)
+    learner = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, learner)
+    return learner, {**info, "grad_norm": grad_norm, "skipped": 1.0 - finite}
+
+
+def update(
+    config: PPOConfig,
+    apply: Apply,
+    log_std: jax.Array,
+    learner: Learner,
+    samples: Samples,
+    key: jax.Array,
+) -> tuple[Learner, dict[str, jax.Array]]:
+    """All epochs of one rollout's samples [B, ...]: shuffled minibatches, one gradient step each.
+
+    `log_std` [16] is the deviation that the samples were drawn with.
+    """
+    samples = samples.replace(advantage=_normalise(samples.advantage, samples.valid))
+    size = samples.index.shape[0]
+
+    def minibatch(learner: Learner, rows: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
+        batch = jax.tree.map(lambda x: x[rows], samples)
+        return gradient_step(config, apply, log_std, learner, batch)
+
+    def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
+        rows = jax.random.permutation(key, size).reshape(config.minibatches, -1)
+        return jax.lax.scan(minibatch, learner, rows)
+
+    learner, info = jax.lax.scan(epoch, learner, jax.random.split(key, config.epochs))
+    return learner, jax.tree.map(jnp.mean, info)
+
+
+def _normalise(advantage: jax.Array, valid: jax.Array) -> jax.Array:
+    """Zero mean and unit deviation over the valid samples of the whole batch (HG)."""
+    mean = jnp.mean(advantage, where=valid)
+    std = jnp.std(advantage, where=valid)
+    return (advantage - mean) / (std + 1e-8)

@@ -1,0 +1,283 @@
+"""Reward terms: small pure functions of one environment's `Inputs`, weighted and summed in `total`.
+
+Every term returns its unweighted value, which is logged. Terms are Humanoid-Gym's (HG) unless an
+equation of the paper is named; where an equation cannot mean what it says, docs/fidelity.md tells
+how it is read.
+"""
+
+from collections.abc import Callable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from kslc_jax.commands import Command, speed_share
+from kslc_jax.config import RewardConfig
+from kslc_jax.gait import SOLE_DROP, GaitState
+from kslc_jax.maths import norm, quat_rotate_inverse
+from kslc_jax.robot import Robot
+from kslc_jax.signals import Signals
+
+
+@flax.struct.dataclass
+class Inputs:
+    """What rewards may read. `last_*` are of the control step before."""
+
+    signals: Signals
+    gait: GaitState
+    command: Command
+    reference: jax.Array  # [16] rad
+    action: jax.Array  # [16] as applied: delayed and noisy
+    last_action: jax.Array  # [16]
+    last_last_action: jax.Array  # [16]
+    last_joint_vel: jax.Array  # [16] rad/s
+    last_base_velocity: jax.Array  # [6] world, m/s and rad/s
+    v_max: jax.Array  # [] m/s, the curriculum's
+
+
+Term = Callable[[RewardConfig, Robot, float, Inputs], jax.Array]
+"""(config, robot, control step [s], inputs) -> unweighted value []."""
+
+
+# ------------------------------------------------------------------- paper: angular momentum, Eq. 4
+
+
+def angular_momentum(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Eq. 4 as read: clip(1 - exp(|L| / scale), c1, 0); zero at rest, falling with |L|."""
+    exponent = norm(x.signals.angular_momentum) / cfg.momentum_scale
+    # The exponent is capped where the clip acts anyway, so that exp cannot overflow.
+    exponent = jnp.minimum(exponent, jnp.log(1.0 - cfg.momentum_floor))
+    return jnp.clip(1.0 - jnp.exp(exponent), cfg.momentum_floor, 0.0)
+
+
+# -------------------------------------------------------------- paper: velocity-related, Eq. 6 to 8
+
+
+def base_height(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Eq. 6 as read: exp(-beta |h - (1 - gamma g) target|); HG's with g = 0."""
+    stance = x.gait.stance.astype(jnp.float32)
+    sole = jnp.sum(x.signals.foot_pos[:, 2] * stance) / jnp.sum(stance) - SOLE_DROP
+    height = x.signals.base_pos[2] - sole
+    drop = cfg.base_height_drop * speed_share(x.command, x.v_max) if cfg.velocity_rewards else 0.0
+    target = cfg.base_height_target * (1.0 - drop)
+    return jnp.exp(-cfg.base_height_kernel * jnp.abs(height - target))
+
+
+def feet_clearance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Eq. 7 as read: swing mask times exp(-|h - (1 + gain g) target| / width); else HG's window."""
+    swing = ~x.gait.stance
+    if not cfg.velocity_rewards:
+        near = jnp.abs(x.gait.swing_height - cfg.clearance_target) < cfg.clearance_width
+        return jnp.sum(near & swing).astype(jnp.float32)
+    gain = cfg.clearance_speed_gain * speed_share(x.command, x.v_max)
+    error = jnp.abs(x.gait.swing_height - cfg.clearance_target * (1.0 + gain))
+    return jnp.sum(jnp.exp(-error / cfg.clearance_width) * swing)
+
+
+def joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Eq. 8 as read: errors weighted by exp(-|speed| / speed limit); HG's without that factor."""
+    error = x.signals.joint_pos - x.reference
+    if cfg.velocity_rewards:
+        error = error * jnp.exp(-jnp.abs(x.signals.joint_vel) / robot.speed_limit)
+    n = norm(error)
+    penalty = cfg.joint_pos_penalty * jnp.clip(n, 0.0, cfg.joint_pos_clip)
+    return jnp.exp(-cfg.joint_pos_kernel * n) - penalty
+
+
+# ----------------------------------------------------------------------------------- HG: tracking
+
+
+def tracking_lin_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """exp(-sigma |xy velocity error|^2), base frame; its maximum, 1, is the curriculum's yardstick."""
+    error = x.signals.base_linvel[:2] - x.command.velocity[:2]
+    return jnp.exp(-cfg.tracking_sigma * jnp.sum(jnp.square(error)))
+
+
+def tracking_ang_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """exp(-sigma (yaw-rate error)^2)."""
+    error = x.signals.base_angvel[2] - x.command.velocity[2]
+    return jnp.exp(-cfg.tracking_sigma * jnp.square(error))
+
+
+def vel_mismatch_exp(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Little vertical velocity, roll rate and pitch rate."""
+    vertical = jnp.exp(-10.0 * jnp.square(x.signals.base_linvel[2]))
+    return 0.5 * (vertical + jnp.exp(-5.0 * norm(x.signals.base_angvel[:2])))
+
+
+def low_speed(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """-1 below half the commanded vx, 0 above 1.2 times, 1.2 between, -2 in the wrong direction."""
+    speed, command = x.signals.base_linvel[0], x.command.velocity[0]
+    share = jnp.abs(speed) / jnp.maximum(jnp.abs(command), 1e-6)
+    value = jnp.where(share < 0.5, -1.0, jnp.where(share > 1.2, 0.0, 1.2))
+    value = jnp.where(jnp.sign(speed) != jnp.sign(command), -2.0, value)
+    return value * (jnp.abs(command) > 0.1)
+
+
+def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Sharp kernels minus a linear error, which has a gradient at any distance."""
+    linear = norm(x.signals.base_linvel[:2] - x.command.velocity[:2])
+    angular = jnp.abs(x.signals.base_angvel[2] - x.command.velocity[2])
+    kernels = 0.5 * (jnp.exp(-10.0 * linear) + jnp.exp(-10.0 * angular))
+    return kernels - 0.2 * (linear + angular)
+
+
+# --------------------------------------------------------------------------------------- HG: feet
+
+
+def feet_contact_number(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Mean over the feet: 1 where contact and clock agree, -0.3 where not."""
+    return jnp.mean(jnp.where(x.signals.foot_contact == x.gait.stance, 1.0, -0.3))
+
+
+def feet_air_time(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Air time of the feet that landed, at most 0.5 s each."""
+    return jnp.sum(jnp.clip(x.gait.landing, 0.0, 0.5))
+
+
+def foot_slip(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Root of the planar speed of the feet in contact."""
+    speed = norm(x.signals.foot_vel[:, :2])
+    return jnp.sum(jnp.sqrt(speed) * x.signals.foot_contact)
+
+
+def feet_contact_forces(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Force above `max_contact_force`, at most 400 N a foot."""
+    return jnp.sum(jnp.clip(x.signals.foot_force - cfg.max_contact_force, 0.0, 400.0))
+
+
+def _spread(cfg: RewardConfig, x: Inputs, points: jax.Array, bounds: tuple[float, float]):
+    """Reward of keeping two points [2, 3] within `bounds` [m] of each other."""
+    apart = points[0] - points[1]
+    if cfg.lateral_distance:
+        distance = jnp.abs(_heading_frame(x, apart)[1])
+    else:
+        distance = norm(apart[:2])
+    near = jnp.clip(distance - bounds[0], -0.5, 0.0)
+    far = jnp.clip(distance - bounds[1], 0.0, 0.5)
+    return 0.5 * (jnp.exp(-100.0 * jnp.abs(near)) + jnp.exp(-100.0 * jnp.abs(far)))
+
+
+def _heading_frame(x: Inputs, vector: jax.Array) -> jax.Array:
+    """World vector [3] in the frame turned by the robot's yaw."""
+    half = 0.5 * x.signals.base_euler[2]
+    zero = jnp.zeros(())
+    return quat_rotate_inverse(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)]), vector)
+
+
+def feet_distance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Feet neither too near nor too far apart."""
+    return _spread(cfg, x, x.signals.foot_pos, cfg.feet_distance)
+
+
+def knee_distance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Knees neither too near nor too far apart."""
+    return _spread(cfg, x, x.signals.knee_pos, cfg.knee_distance)
+
+
+# ------------------------------------------------------------------------------------ HG: posture
+
+
+def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Little leg roll and yaw; a faint pull of all joints to zero."""
+    q = x.signals.joint_pos
+    left, right = (robot.joint_names.index(f"{side}_leg_roll_joint") for side in ("left", "right"))
+    legs = norm(q[left : left + 2]) + norm(q[right : right + 2])
+    return jnp.exp(-100.0 * jnp.clip(legs - 0.1, 0.0, 50.0)) - 0.01 * norm(q)
+
+
+def orientation(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Upright torso, but for the configured forward lean."""
+    lean = cfg.lean_per_speed * jnp.abs(x.command.velocity[0])
+    roll, pitch = x.signals.base_euler[0], x.signals.base_euler[1] - lean
+    upright = jnp.stack([jnp.sin(lean), jnp.zeros(())])
+    tilt = norm(x.signals.gravity[:2] - upright)
+    return 0.5 * (jnp.exp(-10.0 * (jnp.abs(roll) + jnp.abs(pitch))) + jnp.exp(-20.0 * tilt))
+
+
+def base_acc(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Little change of the base's 6-D velocity over one step."""
+    return jnp.exp(-3.0 * norm(x.signals.base_velocity - x.last_base_velocity))
+
+
+def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """1 where the torso touches the ground."""
+    return x.signals.torso_contact.astype(jnp.float32)
+
+
+def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Joint motion and distance from the default pose while the command is to stand (ours)."""
+    moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
+    return jnp.where(x.command.moving, 0.0, moved)
+
+
+# ------------------------------------------------------------------------------------- HG: effort
+
+
+def action_smoothness(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """First and second differences of the action, and its size."""
+    first = jnp.sum(jnp.square(x.action - x.last_action))
+    second = jnp.sum(jnp.square(x.action + x.last_last_action - 2.0 * x.last_action))
+    return first + second + 0.05 * jnp.sum(jnp.abs(x.action))
+
+
+def torques(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Sum of squared motor torques."""
+    return jnp.sum(jnp.square(x.signals.torque))
+
+
+def dof_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Sum of squared joint speeds."""
+    return jnp.sum(jnp.square(x.signals.joint_vel))
+
+
+def dof_acc(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Sum of squared joint accelerations over one control step."""
+    return jnp.sum(jnp.square((x.signals.joint_vel - x.last_joint_vel) / dt))
+
+
+def dof_vel_limits(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """Joint speed above `speed_limit_margin` of the limit, as a share of the limit (ours)."""
+    over = jnp.abs(x.signals.joint_vel) / robot.speed_limit - cfg.speed_limit_margin
+    return jnp.sum(jnp.clip(over, 0.0, 1.0))
+
+
+TERMS: dict[str, Term] = {
+    term.__name__: term
+    for term in (
+        angular_momentum,
+        base_height,
+        feet_clearance,
+        joint_pos,
+        tracking_lin_vel,
+        tracking_ang_vel,
+        vel_mismatch_exp,
+        low_speed,
+        track_vel_hard,
+        feet_contact_number,
+        feet_air_time,
+        foot_slip,
+        feet_contact_forces,
+        feet_distance,
+        knee_distance,
+        default_joint_pos,
+        orientation,
+        base_acc,
+        collision,
+        stand_still,
+        action_smoothness,
+        torques,
+        dof_vel,
+        dof_acc,
+        dof_vel_limits,
+    )
+}
+
+
+def evaluate(
+    cfg: RewardConfig, robot: Robot, dt: float, x: Inputs
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """(reward [], raw value of every term): the weighted sum times `dt`, clipped at >= 0 (HG)."""
+    raw = {name: term(cfg, robot, dt, x) for name, term in TERMS.items()}
+    total = dt * sum(getattr(cfg.weights, name) * value for name, value in raw.items())
+    return jnp.maximum(total, 0.0) if cfg.only_positive else total, raw

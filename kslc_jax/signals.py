@@ -1,0 +1,79 @@
+"""PhysicsState -> Signals: every physical quantity that anyone reads, by name.
+
+Training, evaluation, sim-to-sim and export share this file: whichever engine filled the state, the
+same code reads it.
+"""
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from kslc_jax import maths
+from kslc_jax.physics import PhysicsState
+from kslc_jax.robot import Robot
+
+CONTACT_FORCE = 5.0
+"""Foot force [N] above which the foot counts as in contact (HG)."""
+
+
+@flax.struct.dataclass
+class Signals:
+    """Physical quantities of one environment at one instant. Feet and knees: left, right."""
+
+    joint_pos: jax.Array  # [16] rad
+    joint_vel: jax.Array  # [16] rad/s
+    torque: jax.Array  # [16] N m
+    base_pos: jax.Array  # [3] m, world
+    base_quat: jax.Array  # [4]
+    base_euler: jax.Array  # [3] roll, pitch, yaw [rad]
+    base_linvel: jax.Array  # [3] m/s, base frame
+    base_angvel: jax.Array  # [3] rad/s, base frame
+    base_velocity: jax.Array  # [6] linear and angular, world
+    gravity: jax.Array  # [3] unit vector of gravity, base frame
+    foot_pos: jax.Array  # [2, 3] m, world, ankle-roll link
+    foot_vel: jax.Array  # [2, 3] m/s, world
+    knee_pos: jax.Array  # [2, 3] m, world
+    foot_force: jax.Array  # [2] N, normal
+    foot_contact: jax.Array  # [2] bool
+    angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world (paper, Eq. 3)
+    torso_contact: jax.Array  # [] bool: the 0.4 m box around the torso touches the ground (HG)
+
+
+def read(robot: Robot, state: PhysicsState) -> Signals:
+    """All signals of one environment."""
+    quat = state.qpos[3:7]
+
+    def sensor(name: str) -> jax.Array:
+        return state.sensordata[robot.sensor(name)]
+
+    def both(name: str) -> jax.Array:
+        return jnp.stack([sensor(f"left_{name}"), sensor(f"right_{name}")])
+
+    foot_force = both("foot_touch")[:, 0]
+    angvel = state.qvel[3:6]
+    return Signals(
+        joint_pos=state.qpos[7:],
+        joint_vel=state.qvel[6:],
+        torque=state.torque,
+        base_pos=state.qpos[:3],
+        base_quat=quat,
+        base_euler=maths.quat_to_euler(quat),
+        base_linvel=maths.quat_rotate_inverse(quat, state.qvel[:3]),
+        base_angvel=angvel,
+        base_velocity=jnp.concatenate([state.qvel[:3], maths.quat_rotate(quat, angvel)]),
+        gravity=maths.quat_rotate_inverse(quat, jnp.array([0.0, 0.0, -1.0])),
+        foot_pos=both("foot_pos"),
+        foot_vel=both("foot_linvel"),
+        knee_pos=both("knee_pos"),
+        foot_force=foot_force,
+        foot_contact=foot_force > CONTACT_FORCE,
+        angular_momentum=sensor("angmom"),
+        torso_contact=_torso_height(robot, state.qpos[:3], quat) < 0.0,
+    )
+
+
+def _torso_height(robot: Robot, base_pos: jax.Array, quat: jax.Array) -> jax.Array:
+    """Height of the torso box's lowest corner above the ground [m]."""
+    up = maths.quat_rotate_inverse(quat, jnp.array([0.0, 0.0, 1.0]))
+    centre = base_pos[2] + jnp.dot(up, jnp.asarray(robot.torso_box_center))
+    return centre - jnp.dot(jnp.abs(up), jnp.asarray(robot.torso_box_half_size))

@@ -1,0 +1,106 @@
+"""Train XBot-L to walk and run: python -m kslc_jax.train [--preset NAME] [--any.nested.field V]
+
+Picks a preset, lets every field of it be overridden, and trains into a run folder that holds the
+config, versions, metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and leaves;
+--resume goes on bit for bit.
+
+Examples:
+  python -m kslc_jax.train                          # paper preset on a GPU, laptop preset without
+  python -m kslc_jax.train --preset debug           # seconds, to see that everything works
+  python -m kslc_jax.train --preset laptop --without arms --seed 1
+  python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
+  python -m kslc_jax.train --resume --run-dir runs/laptop-seed0
+"""
+
+import argparse
+import dataclasses
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from kslc_jax import config as config_lib
+from kslc_jax import runtime
+from kslc_jax.config import Config, ConfigError
+
+
+@dataclass(frozen=True)
+class Args:
+    """Command line of a training."""
+
+    preset: str = "auto"
+    """auto, paper, laptop, debug, baseline or baseline-laptop. auto: paper on an accelerator, laptop
+    without one."""
+    without: tuple[str, ...] = ()
+    """Ablations: arms, angular-momentum, velocity-rewards, velocity-curriculum, cycle-curriculum."""
+    run_dir: Path | None = None
+    """Where everything goes; runs/PRESET-seedN if not given."""
+    steps: int | None = None
+    """Environment steps in all; short for --run.steps."""
+    resume: bool = False
+    """Go on from the run folder's latest checkpoint."""
+    config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS["laptop"]
+    """Every number of the training, as the preset has it."""
+
+
+def parse(argv: list[str]) -> Args:
+    """Args with `config` filled from preset, ablations, stored config and overrides; ConfigError."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    early.add_argument("--preset", default="auto")
+    early.add_argument("--without", nargs="*", default=[])
+    early.add_argument("--run-dir", "--run_dir", type=Path)
+    early.add_argument("--resume", action="store_true")
+    known, _ = early.parse_known_args(argv)
+    helping = "-h" in argv or "--help" in argv
+    if known.resume and not helping:
+        from kslc_jax import runner
+
+        if known.run_dir is None:
+            raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
+        base = runner.read_config(known.run_dir)
+    else:
+        name = known.preset
+        if name == "auto":
+            name = "laptop" if helping else runtime.auto_preset()
+        base = config_lib.preset(name, tuple(known.without))
+    args = tyro.cli(
+        Args,
+        args=argv,
+        default=Args(config=base),
+        description=__doc__,
+        config=(tyro.conf.FlagConversionOff,) if False else (),
+    )
+    config = args.config
+    if args.steps is not None:
+        config = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=args.steps))
+    return dataclasses.replace(args, config=config)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    runtime.prepare()
+    try:
+        args = parse(argv)
+        from kslc_jax import runner
+        from kslc_jax.checkpoint import CheckpointError
+        from kslc_jax.logs import Progress
+    except (ConfigError, RuntimeError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    name = runtime.auto_preset() if args.preset == "auto" else args.preset
+    run_dir = args.run_dir or Path("runs") / f"{name}-seed{args.config.seed}"
+    progress = Progress(args.config)
+    progress.say(f"preset {name}: {runner.describe(args.config, run_dir)}")
+    try:
+        runner.train(args.config, run_dir, args.resume, progress)
+    except (ConfigError, runner.RunError, CheckpointError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,210 @@
+"""Rollout -> GAE -> PPO update -> curriculum: ONE pure function of ONE state.
+
+`TrainState` is all a training is: saving it and going on from it is the same as not having
+stopped, bit for bit.
+"""
+
+from collections.abc import Callable
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+
+from kslc_jax import curriculum as curriculum_lib
+from kslc_jax import env, networks, ppo
+from kslc_jax.config import Config
+from kslc_jax.curriculum import Curriculum, Progress
+from kslc_jax.env import EnvState, Outcome
+from kslc_jax.networks import Gaussian, Params
+from kslc_jax.ppo import Learner, Samples
+
+Metrics = dict[str, jax.Array]
+
+
+@flax.struct.dataclass
+class TrainState:
+    """Everything a training depends on."""
+
+    learner: Learner
+    env: EnvState  # [N, ...]
+    curriculum: Curriculum
+    key: jax.Array  # [] typed PRNG key, never advanced: steps fold their number in
+    step: jax.Array  # [] int, train steps done
+
+
+@flax.struct.dataclass
+class Trajectory:
+    """One rollout, [T, N, ...]. Frames are stored once; windows are gathered at update time."""
+
+    action: jax.Array  # [T, N, 16]
+    mean: jax.Array  # [T, N, 16]
+    log_prob: jax.Array  # [T, N]
+    value: jax.Array  # [T, N]
+    age: jax.Array  # [T, N] int, control steps since the reset
+    frame: jax.Array  # [T, N, 59] newest actor frame at each step
+    privileged: jax.Array  # [T, N, 89] newest critic frame
+    outcome: Outcome  # [T, N]
+
+
+def make(
+    config: Config,
+) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
+    """(init, train_step), both jitted; train_step donates its argument."""
+    init_jit = jax.jit(lambda seed: init(config, seed))
+
+    def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
+        return step(config, state)
+
+    return lambda: init_jit(config.seed), jax.jit(train_step, donate_argnums=0)
+
+
+def init(config: Config, seed: int | jax.Array) -> TrainState:
+    """The state before the first train step. Episodes start at random ages, so that their ends
+    are spread evenly from the start."""
+    key, key_params, key_env, key_time = jax.random.split(jax.random.key(seed), 4)
+    curriculum = curriculum_lib.init(config)
+    env_keys = jax.random.split(key_env, config.env.num_envs)
+    envs = jax.vmap(env.reset, (None, 0, None))(config, env_keys, curriculum)
+    times = jax.random.randint(key_time, (config.env.num_envs,), 0, config.episode_steps)
+    return TrainState(
+        learner=ppo.init(config.ppo, networks.init(config, key_params)),
+        env=envs.replace(time=times),
+        curriculum=curriculum,
+        key=key,
+        step=jnp.zeros((), jnp.int32),
+    )
+
+
+def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
+    """One rollout and one update; see the module's first line."""
+    key_roll, key_update = jax.random.split(jax.random.fold_in(state.key, state.step))
+    params = state.learner.params
+    envs, traj = rollout(config, params, state.env, state.curriculum, key_roll)
+    last_value = networks.value(config, params, envs.privileged_history)
+    samples = _samples(config, traj, last_value)
+    apply = _observer(config, state.env, traj)
+    log_std = networks.log_std(config, params)
+    learner, losses = ppo.update(config.ppo, apply, log_std, state.learner, samples, key_update)
+    progress = _progress(traj.outcome)
+    curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
+    new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
+    return new, _metrics(config, new, traj.outcome, progress, losses)
+
+
+def rollout(
+    config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
+) -> tuple[EnvState, Trajectory]:
+    """T control steps of N environments under the sampled policy."""
+
+    def one(envs: EnvState, key: jax.Array) -> tuple[EnvState, Trajectory]:
+        key_act, key_env = jax.random.split(key)
+        dist = networks.policy(config, params, envs.history)
+        action = dist.sample(key_act)
+        keys = jax.random.split(key_env, config.env.num_envs)
+        new, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(
+            config, envs, action, keys, curriculum
+        )
+        return new, Trajectory(
+            action=action,
+            mean=dist.mean,
+            log_prob=dist.log_prob(action),
+            value=networks.value(config, params, envs.privileged_history),
+            age=envs.time,
+            frame=envs.history[:, -1],
+            privileged=envs.privileged_history[:, -1],
+            outcome=outcome,
+        )
+
+    return jax.lax.scan(one, envs, jax.random.split(key, config.ppo.rollout_steps))
+
+
+def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
+    """Flattened PPO samples [T * N, ...] with advantages."""
+    out = traj.outcome
+    done = out.terminated | out.truncated
+    advantage, target = jax.vmap(ppo.gae, (1, 1, 0, 1, 1, None, None), 1)(
+        out.reward, traj.value, last_value, done, out.truncated, config.ppo.gamma, config.ppo.lam
+    )
+    samples = Samples(
+        index=jnp.arange(config.batch_size).reshape(traj.value.shape),
+        action=traj.action,
+        mean=traj.mean,
+        log_prob=traj.log_prob,
+        value=traj.value,
+        advantage=advantage,
+        target=target,
+        valid=~out.broken,
+    )
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
+
+
+def _observer(config: Config, start: EnvState, traj: Trajectory) -> ppo.Apply:
+    """The networks at the observations of `traj`, named by their flat index t * N + n."""
+    actor = _windows(start.history, traj.frame, traj.age)
+    critic = _windows(start.privileged_history, traj.privileged, traj.age)
+
+    def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array]:
+        dist = networks.policy(config, params, actor(index))
+        return dist, networks.value(config, params, critic(index))
+
+    return apply
+
+
+def _windows(
+    history: jax.Array, frame: jax.Array, age: jax.Array
+) -> Callable[[jax.Array], jax.Array]:
+    """Gathers the histories [B, K, W] that were seen at flat indices t * N + n.
+
+    Frames [T, N, W] are kept once, behind those of the `history` [N, K, W] at the start; what is
+    older than the episode is zero, as after a reset.
+    """
+    num_envs, frames, _ = history.shape
+    before = jnp.swapaxes(history[:, :-1], 0, 1)
+    rows = jnp.concatenate([before, frame]).reshape(-1, frame.shape[-1])
+    ages = age.reshape(-1)
+    back = jnp.arange(frames)
+
+    def gather(index: jax.Array) -> jax.Array:
+        window = rows[index[:, None] + back * num_envs]
+        known = frames - 1 - back <= ages[index][:, None]
+        return jnp.where(known[..., None], window, 0.0)
+
+    return gather
+
+
+def _progress(out: Outcome) -> Progress:
+    """What the rollout says about the policy, for the curriculum."""
+    done = out.terminated | out.truncated
+    fast_count, done_count = jnp.sum(out.fast), jnp.sum(done)
+    return Progress(
+        tracking=jnp.mean(out.tracking),
+        fast_tracking=jnp.sum(out.tracking * out.fast) / jnp.maximum(fast_count, 1),
+        fast_count=fast_count,
+        episode_steps=jnp.sum(out.episode_steps * done) / jnp.maximum(done_count, 1),
+        episode_count=done_count,
+    )
+
+
+def _metrics(
+    config: Config, state: TrainState, out: Outcome, progress: Progress, losses: Metrics
+) -> Metrics:
+    """Scalars of one train step. `reward/...` are raw terms, before weights."""
+    terms = {f"reward/{name}": jnp.mean(value) for name, value in out.terms.items()}
+    return {
+        "step": state.step,
+        "reward": jnp.mean(out.reward),
+        "tracking": progress.tracking,
+        "fast_tracking": progress.fast_tracking,
+        "episode_steps": state.curriculum.episode_steps,
+        "falls": jnp.mean(out.terminated),
+        "broken": jnp.mean(out.broken),
+        "speeding": jnp.mean(out.speeding),
+        "curriculum/v_max": state.curriculum.v_max,
+        "curriculum/cycle_time": state.curriculum.cycle_time,
+        "curriculum/tracking": state.curriculum.tracking,
+        "curriculum/fast_tracking": state.curriculum.fast_tracking,
+        "ppo/learning_rate": state.learner.learning_rate,
+        "ppo/std": jnp.mean(jnp.exp(networks.log_std(config, state.learner.params))),
+        **{f"ppo/{name}": value for name, value in losses.items()},
+        **terms,
+    }
