@@ -30,7 +30,7 @@ BEST_METRIC = "score"
 
 
 class CheckpointError(RuntimeError):
-    """A checkpoint that is missing, damaged or of another config; the message says which and where."""
+    """A checkpoint that is missing, damaged or of another config; the message says which."""
 
 
 def _split(state: TrainState) -> dict[str, Any]:
@@ -60,9 +60,7 @@ def _join(parts: dict[str, Any], like: TrainState) -> TrainState:
 def _abstract(tree: Any) -> Any:
     """Shapes with an explicit sharding, so that a checkpoint restores on any device count."""
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree
-    )
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
 class Store:
@@ -78,7 +76,9 @@ class Store:
                     [
                         policies.LatestN(keep),
                         policies.BestN(
-                            n=1, get_metric_fn=lambda m: m[BEST_METRIC], keep_checkpoints_without_metrics=False
+                            n=1,
+                            get_metric_fn=lambda m: m[BEST_METRIC],
+                            keep_checkpoints_without_metrics=False,
                         ),
                     ]
                 ),

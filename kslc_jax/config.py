@@ -202,7 +202,7 @@ class RandomizeConfig:
 class RewardWeights:
     """Weight of each reward term; every one is multiplied by the control step (HG)."""
 
-    # Paper, Eq. 5 to 8 (alpha_p, alpha_f, alpha_b: HG's weights of the terms they replace) and Eq. 4.
+    # Paper: Eq. 5 to 8 (alpha_p, alpha_f, alpha_b are HG's weights of the same terms), Eq. 4.
     joint_pos: float = 1.6
     feet_clearance: float = 1.0
     base_height: float = 0.2
@@ -267,7 +267,7 @@ class RewardConfig:
     max_contact_force: float = 700.0
     """Foot force [N] above which feet_contact_forces counts (HG)."""
     lateral_distance: bool = False
-    """Feet and knee distance across the heading instead of in the plane, so that strides are free."""
+    """Feet and knee distance across the heading, not in the plane, so that strides are free."""
     feet_distance: Range = (0.2, 0.5)
     knee_distance: Range = (0.2, 0.25)
     lean_per_speed: float = 0.0
@@ -360,7 +360,7 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """The host's side of a training: length, logs, checkpoints. Changes no number of the training."""
+    """The host's side of a training: length, logs, checkpoints; changes no number of it."""
 
     steps: int = 737_000_000
     """Environment steps in all (paper's base: 3001 iterations of 4096 x 60)."""

@@ -1,4 +1,4 @@
-"""Curriculum of commanded speed (paper, Eq. 9) and gait cycle (Eq. 10), carried in the train state."""
+"""Curriculum of commanded speed (paper, Eq. 9) and gait cycle (Eq. 10): part of the train state."""
 
 import flax.struct
 import jax

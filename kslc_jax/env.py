@@ -18,6 +18,9 @@ from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics
 from kslc_jax.signals import Signals
 
+DIVERGED = 1e3
+"""Speed [m/s, rad/s] above which, or non-finite, the physics counts as broken."""
+
 
 @flax.struct.dataclass
 class EnvState:
@@ -38,12 +41,12 @@ class EnvState:
 
 @flax.struct.dataclass
 class Outcome:
-    """What one step gives beside the next state. `terminated` and `truncated` exclude each other."""
+    """What one step gives beside the next state. Never both `terminated` and `truncated`."""
 
     reward: jax.Array  # []
-    terminated: jax.Array  # [] bool: fell, or the physics went non-finite
+    terminated: jax.Array  # [] bool: fell, or the physics broke
     truncated: jax.Array  # [] bool: time limit
-    broken: jax.Array  # [] bool: non-finite physics; its sample is not to be learnt from
+    broken: jax.Array  # [] bool: the physics diverged; its sample is not to be learnt from
     terms: dict[str, jax.Array]  # raw reward terms, see rewards.TERMS
     tracking: jax.Array  # [] tracking_lin_vel, share of its maximum
     fast: jax.Array  # [] bool: the command was in the top part of the range
@@ -100,7 +103,7 @@ def step(
     new = physics.step(
         config.physics, state.physics, target, state.dynamics, config.randomize.ground_friction
     )
-    broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.isfinite(new.qvel)))
+    broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.abs(new.qvel) < DIVERGED))
     new = maths.tree_where(broken, state.physics, new)
     now = signals.read(robot, new)
 

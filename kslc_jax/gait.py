@@ -85,9 +85,7 @@ def update(
     )
 
 
-def _clock(
-    config: GaitConfig, phase: jax.Array, command: Command
-) -> tuple[jax.Array, jax.Array]:
+def _clock(config: GaitConfig, phase: jax.Array, command: Command) -> tuple[jax.Array, jax.Array]:
     """sin and cos of the phase [2], and the stance mask [2]."""
     angle = 2.0 * jnp.pi * phase
     s = jnp.sin(angle)

@@ -1,6 +1,6 @@
 """Actor and critic: ELU networks over stacked frames; diagonal Gaussian with a free deviation."""
 
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import flax.struct
@@ -87,7 +87,7 @@ def policy(config: Config, params: Params, history: jax.Array) -> Gaussian:
     """
 
     def f(x: jax.Array) -> jax.Array:
-        return _actor(config).apply({"params": params["actor"]}, x)
+        return cast(jax.Array, _actor(config).apply({"params": params["actor"]}, x))
 
     if not config.network.symmetric:
         return Gaussian(f(history), log_std(config, params))
@@ -109,4 +109,5 @@ def log_std(config: Config, params: Params) -> jax.Array:
 
 def value(config: Config, params: Params, privileged: jax.Array) -> jax.Array:
     """State value [...] for critic histories [..., Kp, 89]."""
-    return _critic(config).apply({"params": params["critic"]}, privileged)[..., 0]
+    out = cast(jax.Array, _critic(config).apply({"params": params["critic"]}, privileged))
+    return out[..., 0]

@@ -43,7 +43,9 @@ class PhysicsState:
     """What the next control step, and every signal, is computed from."""
 
     qpos: jax.Array  # [23] base position [m], base quaternion (w, x, y, z), joint angles [rad]
-    qvel: jax.Array  # [22] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
+    qvel: (
+        jax.Array
+    )  # [22] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
     qacc_warmstart: jax.Array  # [22] contact solver's start
     sensordata: jax.Array  # [S] named sensors of the model, see Robot.sensor
     torque: jax.Array  # [16] motor torques of the last physics step [N m]
@@ -250,7 +252,7 @@ def _host_step(
             ctrl[:] = servo_control(robot, torque, q, dq)
             last = i == config.decimation - 1
             batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
-        new = PhysicsState(qpos, qvel, warmstart, sensordata, torque)  # type: ignore[arg-type]
-        return jax.tree.map(
-            lambda x: np.array(x, np.float32).reshape(*lead, *x.shape[1:]), new
+        new = state.replace(
+            qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, sensordata=sensordata, torque=torque
         )
+        return jax.tree.map(lambda x: np.array(x, np.float32).reshape(*lead, *x.shape[1:]), new)

@@ -61,7 +61,9 @@ def gae(
 ) -> tuple[jax.Array, jax.Array]:
     """Generalised advantage estimation for ONE environment (Schulman et al. 2016).
 
-    delta_t = r_t + gamma V_{t+1} (1 - done_t) - V_t;  A_t = delta_t + gamma lam (1 - done_t) A_{t+1}.
+    delta_t = r_t + gamma V_{t+1} (1 - done_t) - V_t
+    A_t = delta_t + gamma lam (1 - done_t) A_{t+1}
+
     A time-out is not a failure: there r_t gains gamma V_t in place of the value it was cut from
     (Humanoid-Gym; the state after the cut is gone).
 
@@ -122,7 +124,7 @@ def loss(
 
 
 def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
-    """Divides the rate where KL > 2 desired, multiplies it where KL < desired / 2, within bounds."""
+    """Lowers the rate where KL > 2 desired, raises it where KL < desired / 2, within bounds."""
     rate = jnp.where(kl > 2.0 * config.desired_kl, rate / config.learning_rate_factor, rate)
     slow = (kl > 0.0) & (kl < 0.5 * config.desired_kl)
     rate = jnp.where(slow, rate * config.learning_rate_factor, rate)

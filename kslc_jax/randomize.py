@@ -52,9 +52,7 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
     )
 
 
-def model_fields(
-    robot: Robot, dynamics: Dynamics, ground_friction: float
-) -> dict[str, jax.Array]:
+def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> dict[str, jax.Array]:
     """The mjModel fields that `dynamics` changes, by name; both engines take them as they are.
 
     Friction is the mean of foot and ground, PhysX's rule (MuJoCo would take the larger); the base's
@@ -74,5 +72,5 @@ def model_fields(
         .at[base]
         .multiply(mass / model.body_mass[base]),
         "body_ipos": jnp.asarray(model.body_ipos).at[base].add(dynamics.base_com),
-        "body_subtreemass": subtree.at[:base + 1].add(dynamics.base_mass),
+        "body_subtreemass": subtree.at[: base + 1].add(dynamics.base_mass),
     }

@@ -88,7 +88,7 @@ def joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def tracking_lin_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """exp(-sigma |xy velocity error|^2), base frame; its maximum, 1, is the curriculum's yardstick."""
+    """exp(-sigma |xy velocity error|^2), base frame; the curriculum's yardstick, at most 1."""
     error = x.signals.base_linvel[:2] - x.command.velocity[:2]
     return jnp.exp(-cfg.tracking_sigma * jnp.sum(jnp.square(error)))
 
@@ -149,10 +149,8 @@ def feet_contact_forces(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -
 def _spread(cfg: RewardConfig, x: Inputs, points: jax.Array, bounds: tuple[float, float]):
     """Reward of keeping two points [2, 3] within `bounds` [m] of each other."""
     apart = points[0] - points[1]
-    if cfg.lateral_distance:
-        distance = jnp.abs(_heading_frame(x, apart)[1])
-    else:
-        distance = norm(apart[:2])
+    lateral = jnp.abs(_heading_frame(x, apart)[1])
+    distance = lateral if cfg.lateral_distance else norm(apart[:2])
     near = jnp.clip(distance - bounds[0], -0.5, 0.0)
     far = jnp.clip(distance - bounds[1], 0.0, 0.5)
     return 0.5 * (jnp.exp(-100.0 * jnp.abs(near)) + jnp.exp(-100.0 * jnp.abs(far)))

@@ -81,6 +81,8 @@ def load(
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
+    # A diverged simulation must show as NaN, not restart behind our back.
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     # Torque limits depend on joint speed and are applied in physics.motor_torque. The engine must
     # not clamp as well: C MuJoCo drops the implicit damping of a saturated actuator, MJX keeps it.
     model.actuator_forcelimited[:] = 0

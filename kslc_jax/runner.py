@@ -89,7 +89,9 @@ def open_folder(run_dir: Path, config: Config, resume: bool) -> None:
         difference(read_config(run_dir), config)
         return
     if path.exists():
-        raise RunError(f"{run_dir} already holds a training: add --resume, or name another --run-dir")
+        raise RunError(
+            f"{run_dir} already holds a training: add --resume, or name another --run-dir"
+        )
     try:
         run_dir.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(config_lib.to_dict(config), indent=1))
@@ -99,7 +101,7 @@ def open_folder(run_dir: Path, config: Config, resume: bool) -> None:
 
 
 def read_config(run_dir: Path) -> Config:
-    """The config stored in a run folder; RunError if there is none, ConfigError if it is damaged."""
+    """The config stored in a run folder; RunError if there is none, ConfigError if damaged."""
     path = run_dir / "config.json"
     if not path.exists():
         raise RunError(f"{run_dir} holds no training to resume (no config.json)")
@@ -117,7 +119,9 @@ def difference(stored: Config, wanted: Config) -> None:
             for f in dataclasses.fields(a):
                 walk(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}".lstrip("."))
         elif a != b:
-            raise ConfigError(f"{where} is {a} in the run to resume, not {b}: start a new run for that")
+            raise ConfigError(
+                f"{where} is {a} in the run to resume, not {b}: start a new run for that"
+            )
 
     for f in dataclasses.fields(stored):
         if f.name != "run":
@@ -202,8 +206,9 @@ def _farewell(
 def describe(config: Config, run_dir: Path) -> str:
     """One paragraph on what is about to run."""
     n, t = config.env.num_envs, config.ppo.rollout_steps
+    engine, device = physics.resolve_engine(config.physics), jax.devices()[0].device_kind
     return (
         f"{n} environments x {t} steps = {config.batch_size} samples an update, "
-        f"{config.run.steps / 1e6:.1f}M steps in all; engine {physics.resolve_engine(config.physics)} "
-        f"on {jax.devices()[0].device_kind}; run folder {run_dir}"
+        f"{config.run.steps / 1e6:.2f}M steps in all; engine {engine} on {device}; "
+        f"run folder {run_dir}"
     )

@@ -31,5 +31,6 @@ def check_jax(version: str, backend: str) -> None:
     """RuntimeError for versions that hang on this backend, with the fix."""
     if backend == "cpu" and version.startswith(BAD_JAX):
         raise RuntimeError(
-            f"jax {version} can hang for ever on a CPU: pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
+            f"jax {version} can hang for ever on a CPU, install another: "
+            "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
         )

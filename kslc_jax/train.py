@@ -31,10 +31,11 @@ class Args:
     """Command line of a training."""
 
     preset: str = "auto"
-    """auto, paper, laptop, debug, baseline or baseline-laptop. auto: paper on an accelerator, laptop
-    without one."""
+    """auto, paper, laptop, debug, baseline or baseline-laptop. auto is paper on an accelerator,
+    laptop without one."""
     without: tuple[str, ...] = ()
-    """Ablations: arms, angular-momentum, velocity-rewards, velocity-curriculum, cycle-curriculum."""
+    """What to leave out, for ablations: arms, angular-momentum, velocity-rewards,
+    velocity-curriculum, cycle-curriculum."""
     run_dir: Path | None = None
     """Where everything goes; runs/PRESET-seedN if not given."""
     steps: int | None = None
@@ -46,7 +47,7 @@ class Args:
 
 
 def parse(argv: list[str]) -> Args:
-    """Args with `config` filled from preset, ablations, stored config and overrides; ConfigError."""
+    """Args, with `config` made of preset or stored config, ablations and overrides; ConfigError."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset", default="auto")
     early.add_argument("--without", nargs="*", default=[])
@@ -70,7 +71,6 @@ def parse(argv: list[str]) -> Args:
         args=argv,
         default=Args(config=base),
         description=__doc__,
-        config=(tyro.conf.FlagConversionOff,) if False else (),
     )
     config = args.config
     if args.steps is not None:

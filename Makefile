@@ -1,0 +1,41 @@
+# Two commands are all a newcomer needs: `make train` and `make test`; each sets itself up.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: help train test test-all lint bench clean
+
+help: ## What there is
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	  || { echo "error: Python 3.11 or newer is needed, try: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 2; }
+	@$(PYTHON) -m venv $(VENV) \
+	  || { echo "error: the venv module is missing, try: apt-get install python3-venv"; exit 2; }
+	@echo "installing into $(VENV) (a minute or two)"
+	@$(PIP) -e '.[dev]'
+	@touch $@
+
+train: $(STAMP) ## Train XBot-L: make train ARGS="--preset laptop --seed 1"
+	@$(BIN)/python -m kslc_jax.train $(ARGS)
+
+test: $(STAMP) ## Quick test suite, a few minutes
+	@$(BIN)/python -m pytest $(ARGS)
+
+test-all: $(STAMP) ## All tests, slow ones too
+	@$(BIN)/python -m pytest -m "" $(ARGS)
+
+lint: $(STAMP) ## ruff and ty
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ty check
+
+bench: $(STAMP) ## Throughput of a whole training step
+	@$(BIN)/python benchmarks/throughput.py $(ARGS)
+
+clean: ## Remove the virtual environment and caches, not runs/
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis *.egg-info

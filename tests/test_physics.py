@@ -1,0 +1,213 @@
+"""Both engines: torque limits, parity, batch independence, divergence."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import physics, randomize, robot
+from kslc_jax.config import PhysicsConfig, RandomizeConfig
+
+ENGINES = ("mjx", "mujoco")
+GROUND = 0.6
+
+
+def make_step(engine: str, **changes):
+    config = PhysicsConfig(engine=engine, **changes)
+    return jax.jit(lambda s, t, d: physics.step(config, s, t, d, GROUND))
+
+
+def standing(config: PhysicsConfig) -> physics.PhysicsState:
+    """Feet on the floor, at rest."""
+    qpos = jnp.asarray(physics.robot_for(config).default_qpos, jnp.float32).at[2].set(0.885)
+    return physics.initial_state(config, qpos, jnp.zeros(22))
+
+
+class TestMotorTorque:
+    """Hand-computed; the left knee has kp 350, kd 10, 212.5 N m, 12 rad/s."""
+
+    KNEE = 3
+
+    def torque(self, q=0.0, dq=0.0, target=0.0, **factors):
+        dyn = randomize.nominal().replace(**factors)
+        return physics.motor_torque(
+            robot.load(),
+            dyn,
+            jnp.full(16, q),
+            jnp.full(16, dq),
+            jnp.full(16, target),
+        )[self.KNEE]
+
+    def test_pd(self):
+        assert self.torque(q=0.1, dq=1.0, target=0.3) == pytest.approx(350 * 0.2 - 10.0)
+
+    def test_effort_limit_is_085_of_the_urdf(self):
+        assert self.torque(target=2.0) == pytest.approx(0.85 * 250)
+        assert self.torque(target=-2.0) == pytest.approx(-0.85 * 250)
+
+    @pytest.mark.parametrize(
+        ("dq", "available"),
+        [(9.0, 212.5), (10.5, 106.25), (12.0, 0.0), (15.0, 0.0), (-15.0, 212.5)],
+    )
+    def test_driving_torque_falls_to_zero_at_the_speed_limit(self, dq, available):
+        """75 % of 12 rad/s is 9; half way to 12 is 10.5. Braking (dq < 0) keeps all of it."""
+        assert self.torque(dq=dq, target=5.0) == pytest.approx(available, abs=1e-4)
+        assert self.torque(dq=-dq, target=-5.0) == pytest.approx(-available, abs=1e-4)
+
+    def test_factors(self):
+        half = jnp.full(16, 0.5)
+        assert self.torque(target=0.2, kp=half) == pytest.approx(35.0)
+        assert self.torque(dq=2.0, kd=half) == pytest.approx(-10.0)
+        assert self.torque(target=5.0, motor_strength=half) == pytest.approx(106.25)
+        friction = self.torque(dq=2.0, joint_friction=half)
+        assert friction == pytest.approx(-20.0 - 0.5 * np.tanh(10.0))
+
+    def test_numpy_and_jax_agree(self):
+        rng = np.random.default_rng(0)
+        q, dq, target = rng.normal(size=(3, 16)) * 4
+        dyn = randomize.nominal()
+        a = physics.motor_torque(robot.load(), dyn, q, dq, target)
+        b = physics.motor_torque(robot.load(), jax.tree.map(np.asarray, dyn), q, dq, target, np)
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
+
+
+def test_servo_control_inverts_the_models_servo(xbot):
+    """kp (ctrl - q) - kd dq of the model equals the wanted torque."""
+    rng = np.random.default_rng(1)
+    q, dq, torque = rng.normal(size=(3, 16)) * [[0.5], [5.0], [100.0]]
+    ctrl = physics.servo_control(xbot, torque, q, dq)
+    np.testing.assert_allclose(xbot.kp * (ctrl - q) - xbot.kd * dq, torque, rtol=1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_no_motor_drives_a_joint_past_its_speed_limit(engine):
+    """Shoulders at full command in the air: 7 rad/s is approached, not passed."""
+    step = make_step(engine)
+    config = PhysicsConfig(engine=engine)
+    state = standing(config)
+    state = state.replace(qpos=state.qpos.at[2].set(3.0))
+    target = jnp.zeros(16).at[jnp.array([12, 14])].set(jnp.array([-3.1, 3.1]))
+    fastest = 0.0
+    for _ in range(30):
+        state = step(state, target, randomize.nominal())
+        fastest = max(fastest, float(jnp.abs(state.qvel[jnp.array([18, 20])]).max()))
+    assert 5.5 < fastest <= 7.0
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """100 control steps of both engines from standing, small sine targets, 8 environments with
+    randomised dynamics."""
+    config = RandomizeConfig(kp=(0.9, 1.1), kd=(0.9, 1.1), base_com=(-0.02, 0.02))
+    keys = jax.random.split(jax.random.key(0), 8)
+    dyn = jax.vmap(randomize.sample, (None, 0))(config, keys)
+    out = {}
+    for engine in ENGINES:
+        c = PhysicsConfig(engine=engine, iterations=10, ls_iterations=10)
+        step = jax.jit(jax.vmap(lambda s, t, d, c=c: physics.step(c, s, t, d, GROUND)))
+        state = jax.vmap(lambda _, c=c: standing(c))(jnp.arange(8))
+        states = []
+        for i in range(100):
+            phase = 2 * jnp.pi * 0.01 * i + jnp.arange(16.0)
+            state = step(state, jnp.tile(0.05 * jnp.sin(phase), (8, 1)), dyn)
+            states.append(jax.tree.map(np.asarray, state))
+        out[engine] = states
+    return out
+
+
+def test_engines_agree_over_100_steps(runs):
+    """float32 MJX against float64 C, with feet in contact. Contact amplifies rounding: 1e-3 in
+    qpos after 100 control steps, 1e-5 after 10."""
+    for i, tolerance in ((9, 1e-5), (99, 1e-3)):
+        a, b = runs["mjx"][i], runs["mujoco"][i]
+        np.testing.assert_allclose(a.qpos, b.qpos, atol=tolerance)
+    last = runs["mujoco"][-1]
+    assert np.all(last.qpos[:, 2] > 0.7), "the robots should still stand"
+    assert np.all(last.sensordata[:, -2:].sum(1) > 200), "and weigh on their feet"
+
+
+def test_torques_and_sensors_agree(runs):
+    a, b = runs["mjx"][9], runs["mujoco"][9]
+    np.testing.assert_allclose(a.torque, b.torque, atol=0.1)
+    np.testing.assert_allclose(a.sensordata, b.sensordata, rtol=1e-2, atol=0.1)
+
+
+def test_threads_do_not_change_results():
+    config = PhysicsConfig(engine="mujoco")
+    dyn = jax.tree.map(lambda x: jnp.tile(x, (4,) + (1,) * x.ndim), randomize.nominal())
+    states = []
+    for threads in (1, 2):
+        c = dataclasses.replace(config, threads=threads)
+        step = jax.jit(jax.vmap(lambda s, t, d, c=c: physics.step(c, s, t, d, GROUND)))
+        state = jax.vmap(lambda _: standing(config))(jnp.arange(4))
+        for i in range(20):
+            state = step(state, jnp.full((4, 16), 0.05 * np.sin(i)), dyn)
+        states.append(state)
+    for a, b in zip(*map(jax.tree.leaves, states), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_batch_is_its_members():
+    """The mujoco engine: environment 1 of a batch equals the same environment alone."""
+    config = PhysicsConfig(engine="mujoco")
+    single = make_step("mujoco")
+    batched = jax.jit(jax.vmap(lambda s, t, d: physics.step(config, s, t, d, GROUND)))
+    keys = jax.random.split(jax.random.key(1), 3)
+    dyn = jax.vmap(randomize.sample, (None, 0))(RandomizeConfig(), keys)
+    state = jax.vmap(lambda _: standing(config))(jnp.arange(3))
+    target = 0.1 * jax.random.normal(jax.random.key(2), (3, 16))
+    many = batched(state, target, dyn)
+    pick = lambda tree: jax.tree.map(lambda x: x[1], tree)
+    one = single(pick(state), target[1], pick(dyn))
+    for a, b in zip(jax.tree.leaves(pick(many)), jax.tree.leaves(one), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_friction_is_the_mean_of_foot_and_ground(xbot):
+    fields = randomize.model_fields(xbot, randomize.nominal(1.4), GROUND)
+    np.testing.assert_allclose(fields["geom_friction"][xbot.foot_geom_ids, 0], 1.0)
+
+
+def test_added_mass_weighs(xbot):
+    """5 kg more on the base press 49 N more on the ground after settling."""
+    step = make_step("mujoco")
+    force = []
+    for extra in (0.0, 5.0):
+        dyn = randomize.nominal().replace(base_mass=jnp.asarray(extra))
+        state = standing(PhysicsConfig(engine="mujoco"))
+        total = []
+        for i in range(60):
+            state = step(state, jnp.zeros(16), dyn)
+            if i >= 30:
+                total.append(float(state.sensordata[-2:].sum()))
+        force.append(np.mean(total))
+    assert force[1] - force[0] == pytest.approx(5 * 9.81, abs=8)
+
+
+def test_mass_randomisation_matches_a_recompiled_model(xbot):
+    """body_subtreemass follows: the whole-body CoM sensor equals that of an edited model."""
+    import mujoco
+
+    fields = randomize.model_fields(
+        xbot,
+        randomize.nominal().replace(base_mass=jnp.asarray(4.0), base_com=jnp.array([0.05, 0, 0])),
+        GROUND,
+    )
+    spec = mujoco.MjSpec.from_file(str(robot.MODEL_PATH))
+    base = spec.body("base_link")
+    base.ipos = base.ipos + np.array([0.05, 0, 0])
+    base.mass += 4.0
+    model = spec.compile()
+    np.testing.assert_allclose(fields["body_subtreemass"], model.body_subtreemass, rtol=1e-6)
+    np.testing.assert_allclose(fields["body_mass"], model.body_mass, rtol=1e-6)
+    np.testing.assert_allclose(fields["body_ipos"], model.body_ipos, atol=1e-7)
+
+
+def test_divergence_shows_as_nan_not_as_a_reset():
+    """C MuJoCo would restart a diverged simulation silently; then nobody could mask it."""
+    step = make_step("mujoco")
+    state = standing(PhysicsConfig(engine="mujoco"))
+    state = state.replace(qvel=state.qvel.at[3].set(jnp.nan))
+    assert not np.all(np.isfinite(step(state, jnp.zeros(16), randomize.nominal()).qpos))
