@@ -491,7 +491,7 @@ _LAPTOP = _override(
             "tracking_lin_vel": 1.6,
             "track_vel_hard": 0.8,
             "dof_vel_limits": -0.5,
-            "stand_still": -0.5,
+            "stand_still": -0.3,
         },
     },
 )

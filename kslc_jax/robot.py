@@ -1,7 +1,7 @@
 """The robot: our MJCF of XBot-L, and everything the rest asks of it by name.
 
 Two fidelities come from the one file: "train", where only the feet meet the floor, and "high", for
-evaluation: 1 ms, elliptic cones, converged solver, self-collision, joint friction and armature.
+evaluation: 1 ms, elliptic cones, converged solver, self-collision, joint friction.
 """
 
 import functools
@@ -43,7 +43,10 @@ class Robot:
 
     def sensor(self, name: str) -> slice:
         """Where the named sensor lies in sensordata; KeyError lists the names."""
-        return _sensor_slices(self)[name]
+        slices = _sensor_slices(self)
+        if name not in slices:
+            raise KeyError(f"no sensor {name!r}; there are {', '.join(slices)}")
+        return slices[name]
 
 
 @functools.lru_cache(maxsize=32)
@@ -75,9 +78,8 @@ def load(
         _raise_fidelity(spec)
     model = spec.compile()
     if fidelity == "high":
-        for field in ("frictionloss", "damping", "armature"):
+        for field in ("frictionloss", "damping"):
             getattr(model, f"dof_{field}")[6:] = model.numeric(f"high_{field}").data
-        mujoco.mj_setConst(model, mujoco.MjData(model))
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations

@@ -13,7 +13,7 @@ import platform
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 from types import FrameType
 
@@ -72,7 +72,7 @@ def versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def locked(run_dir: Path) -> Iterator[None]:
+def locked(run_dir: Path) -> Generator[None]:
     """Holds the run folder's lock; RunError if another process does."""
     with (run_dir / ".lock").open("w") as file:
         try:

@@ -159,7 +159,10 @@ def test_a_batch_is_its_members():
     state = jax.vmap(lambda _: standing(config))(jnp.arange(3))
     target = 0.1 * jax.random.normal(jax.random.key(2), (3, 16))
     many = batched(state, target, dyn)
-    pick = lambda tree: jax.tree.map(lambda x: x[1], tree)
+
+    def pick(tree):
+        return jax.tree.map(lambda x: x[1], tree)
+
     one = single(pick(state), target[1], pick(dyn))
     for a, b in zip(jax.tree.leaves(pick(many)), jax.tree.leaves(one), strict=True):
         np.testing.assert_array_equal(a, b)

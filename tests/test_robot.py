@@ -117,9 +117,21 @@ def test_joint_space_inertia_within_a_tenth_of_a_percent(xbot, poses):
         data = at_origin(xbot.mj_model, q)
         full = np.zeros((22, 22))
         mujoco.mj_fullM(xbot.mj_model, data, full)
+        full -= np.diag(xbot.mj_model.dof_armature)  # rotor inertia, not in the URDF
         expected = inertia_matrix(q)
         np.testing.assert_allclose(np.diag(full), np.diag(expected), rtol=1e-3)
         assert np.linalg.norm(full - expected) < 1e-3 * np.linalg.norm(expected)
+
+
+def test_every_frame_is_the_bases_at_the_zero_pose(xbot, poses):
+    """Our rotations are the URDF's, measured from its zero pose."""
+    zero, _ = forward(np.zeros(16))
+    for q in poses:
+        data, (expected, _) = at_origin(xbot.mj_model, q), forward(q)
+        for i in range(1, xbot.mj_model.nbody):
+            name = xbot.mj_model.body(i).name
+            turned = expected[name][0] @ zero[name][0].T
+            np.testing.assert_allclose(data.xmat[i].reshape(3, 3), turned, atol=1e-4, err_msg=name)
 
 
 def test_limits_gains_and_motors(xbot):
@@ -132,17 +144,75 @@ def test_limits_gains_and_motors(xbot):
     leg = [200, 200, 350, 350, 15, 15]
     np.testing.assert_allclose(xbot.kp, [*leg, *leg, 100, 100, 100, 100])
     np.testing.assert_allclose(xbot.kd, np.full(16, 10.0))
+    np.testing.assert_array_equal(xbot.is_arm, [False] * 12 + [True] * 4)
 
 
-def test_sensors_have_the_sizes_that_signals_read(xbot):
-    sizes = {"angmom": 3, "com": 3, "base_quat": 4}
-    for side in ("left", "right"):
-        sizes |= {f"{side}_foot_touch": 1, f"{side}_foot_pos": 3, f"{side}_knee_pos": 3}
-    for name, size in sizes.items():
-        at = xbot.sensor(name)
-        assert at.stop - at.start == size
-    with pytest.raises(KeyError):
-        xbot.sensor("left_elbow_smell")
+def test_the_engine_itself_limits_no_torque(xbot):
+    """physics.motor_torque does; the servos are plain kp (ctrl - q) - kd dq."""
+    m = xbot.mj_model
+    np.testing.assert_array_equal(m.actuator_biasprm[:, 1], -xbot.kp)
+    np.testing.assert_array_equal(m.actuator_gear[:, 0], 1)
+    assert not m.actuator_forcelimited.any() and not m.actuator_ctrllimited.any()
+    np.testing.assert_allclose(m.dof_armature[6:], 0.01)
+    assert not m.dof_damping.any() and not m.dof_frictionloss.any()
+
+
+@pytest.mark.parametrize("fidelity", ["train", "high"])
+def test_sensors_by_name(fidelity):
+    r = robot.load(fidelity)
+    sizes = {"base_quat": 4, "base_linvel": 3, "base_gyro": 3, "com": 3, "angmom": 3}
+    for quantity in ("foot_pos", "foot_zaxis", "foot_linvel", "knee_pos"):
+        sizes |= {f"left_{quantity}": 3, f"right_{quantity}": 3}
+    sizes |= {"left_foot_touch": 1, "right_foot_touch": 1}
+    ends = np.cumsum(list(sizes.values()))
+    for (name, size), end in zip(sizes.items(), ends, strict=True):
+        assert r.sensor(name) == slice(end - size, end)
+    assert r.mj_model.nsensordata == ends[-1]
+    with pytest.raises(KeyError, match=r"left_elbow_smell.*base_quat.*right_foot_touch"):
+        r.sensor("left_elbow_smell")
+
+
+def test_sensors_read_what_their_names_say(xbot, poses):
+    """Against the URDF's links, in any base pose; speeds from central differences of theirs."""
+    model, rng, h = xbot.mj_model, np.random.default_rng(4), 1e-5
+
+    def links(qpos):
+        turn = np.zeros(9)
+        mujoco.mju_quat2Mat(turn, qpos[3:7])
+        turn = turn.reshape(3, 3)
+        return {k: (turn @ r, qpos[:3] + turn @ p) for k, (r, p) in forward(qpos[7:])[0].items()}
+
+    def moved(qpos, qvel, time):
+        end = qpos.copy()
+        mujoco.mj_integratePos(model, end, qvel, time)
+        return links(end)
+
+    zero, _ = forward(np.zeros(16))
+    data = mujoco.MjData(model)
+    for q in poses:
+        quat = rng.normal(size=4)
+        data.qpos[:] = [*rng.normal(size=3), *(quat / np.linalg.norm(quat)), *q]
+        data.qvel[:] = rng.normal(size=22)
+        mujoco.mj_forward(model, data)
+        here = links(data.qpos)
+        before, after = moved(data.qpos, data.qvel, -h), moved(data.qpos, data.qvel, h)
+        heavy = {k: r for k, r in URDF.items() if r["mass"] > 0}
+        com = sum(r["mass"] * (here[k][1] + here[k][0] @ r["com"]) for k, r in heavy.items())
+        expected = {
+            "base_quat": data.qpos[3:7],
+            "base_linvel": here["base_link"][0].T @ data.qvel[:3],
+            "base_gyro": data.qvel[3:6],
+            "com": com / xbot.total_mass,
+        }
+        for side in ("left", "right"):
+            foot, knee = f"{side}_ankle_roll_link", f"{side}_knee_link"
+            expected[f"{side}_foot_pos"] = here[foot][1]
+            expected[f"{side}_foot_zaxis"] = here[foot][0] @ zero[foot][0].T[:, 2]
+            expected[f"{side}_foot_linvel"] = (after[foot][1] - before[foot][1]) / (2 * h)
+            expected[f"{side}_knee_pos"] = here[knee][1]
+        for name, value in expected.items():
+            actual = data.sensordata[xbot.sensor(name)]
+            np.testing.assert_allclose(actual, value, atol=5e-4, err_msg=name)
 
 
 def test_angular_momentum_is_eq_3(xbot):
@@ -181,6 +251,56 @@ def test_only_soles_and_floor_can_meet_in_training(xbot):
     assert len(meets) == 8 and all("toe" in n or "heel" in n for n in meets)
     assert not m.geom_conaffinity[robots].any()
     assert set(xbot.foot_geom_ids) == {m.geom(n).id for n in meets}
+    feet = {m.body(m.geom_bodyid[i]).name for i in xbot.foot_geom_ids}
+    assert feet == {"left_ankle_roll_link", "right_ankle_roll_link"}
+
+
+@pytest.mark.parametrize("fidelity", ["train", "high"])
+def test_soles_are_where_the_feet_end(fidelity):
+    """0.8853 m below the base; four contacts a foot, spread over the mesh's footprint, not beyond.
+
+    Friction is the foot's (priority): randomize sets that one.
+    """
+    r = robot.load(fidelity)
+    data = mujoco.MjData(r.mj_model)
+    data.qpos[:] = r.default_qpos
+    for height, count in ((0.8853 + 5e-4, 0), (0.8853 - 5e-4, 8)):
+        data.qpos[2] = height
+        mujoco.mj_forward(r.mj_model, data)
+        assert data.ncon == count
+    np.testing.assert_array_equal(data.contact.friction[:, :2], 1.0)
+    for side in (1, -1):
+        points = np.array([c.pos * [1, side, 1] for c in data.contact if side * c.pos[1] > 0])
+        assert len(points) == 4
+        assert np.all((points[:, :2] > [-0.0745, 0.0725]) & (points[:, :2] < [0.1345, 0.1615]))
+        assert np.all(np.ptp(points[:, :2], axis=0) > [0.19, 0.07])
+    assert np.all(r.mj_model.geom_priority[r.foot_geom_ids] == 1)
+    assert np.all(r.mj_model.geom_condim[r.foot_geom_ids] == 3)
+    assert np.all(r.mj_model.geom_friction[r.foot_geom_ids, 0] == 1.0)
+
+
+def test_torso_box_is_humanoid_gyms(xbot):
+    np.testing.assert_allclose(xbot.torso_box_center, [0, 0, 0.1])
+    np.testing.assert_allclose(xbot.torso_box_half_size, 0.2)
+    assert xbot.mj_model.body(xbot.base_body_id).name == "base_link"
+    assert xbot.default_qpos[2] == 0.95 and not xbot.default_qpos[7:].any()
+
+
+def test_options_and_their_overrides(xbot):
+    opt = xbot.mj_model.opt
+    assert (opt.timestep, opt.iterations, opt.ls_iterations) == (0.005, 4, 5)
+    assert opt.cone == mujoco.mjtCone.mjCONE_PYRAMIDAL
+    assert opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    other = robot.load("train", timestep=0.002, iterations=7, ls_iterations=9)
+    opt = other.mj_model.opt
+    assert (opt.timestep, opt.iterations, opt.ls_iterations) == (0.002, 7, 9)
+    assert robot.load("train", timestep=0.002, iterations=7, ls_iterations=9) is other
+    assert robot.load() is xbot and xbot.mj_model.opt.timestep == 0.005
+
+
+def test_mjx_takes_the_model(xbot):
+    model = physics.mjx.put_model(xbot.mj_model, impl="jax")
+    assert (model.nq, model.nu, model.nsensordata) == (23, 16, xbot.mj_model.nsensordata)
 
 
 def test_high_fidelity_options():
@@ -188,7 +308,10 @@ def test_high_fidelity_options():
     assert m.opt.timestep == 0.001
     assert m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert m.opt.iterations >= 100
-    np.testing.assert_allclose(m.dof_frictionloss[6:], [0.01] * 12 + [1.0] * 4)
+    assert m.opt.tolerance <= 1e-10 and m.opt.ls_iterations >= 50
+    leg = [0.01, 0.01, 0.01, 0.01, 0.05, 0.05]  # the public MJCF's ankles rub more
+    np.testing.assert_allclose(m.dof_frictionloss[6:], [*leg, *leg, 1, 1, 1, 1])
+    np.testing.assert_allclose(m.dof_damping[6:], [0.01] * 12 + [1.0] * 4)
     np.testing.assert_allclose(m.dof_armature[6:], 0.01)
     assert m.body_subtreemass[0] == pytest.approx(53.036, abs=1e-3)
 
@@ -210,9 +333,49 @@ def test_high_fidelity_self_collision(xbot):
         q[2:5] = rng.uniform([-1.2, -0.9, -0.6], [0.6, 0.6, 0.6])
         q[8:11] = -q[2:5]
         assert not high_contacts(q)
+    toes_in = np.zeros(16)
+    toes_in[[1, 7]] = [0.9, -0.9]
+    assert frozenset(("left_foot", "right_foot")) in high_contacts(toes_in)
     crossed = np.zeros(16)
     crossed[[0, 6]] = [-0.4, 0.4]
     assert any("left" in " ".join(p) and "right" in " ".join(p) for p in high_contacts(crossed))
+
+
+@pytest.mark.parametrize(("first", "sign"), [(0, 1), (6, -1)])
+def test_a_walking_leg_touches_nothing_but_perhaps_a_hand(first, sign):
+    """All six joints of one leg, hip roll and yaw included."""
+    rng = np.random.default_rng(5)
+    low = np.array([-0.1, -0.3, -1.2, -1.0, -0.6, -0.3])
+    high = np.array([0.4, 0.3, 0.7, 1.0, 0.6, 0.3])
+    for _ in range(200):
+        q = np.zeros(16)
+        q[first : first + 6] = sign * rng.uniform(low, high)
+        touching = high_contacts(q)
+        assert all(any("hand" in name for name in pair) for pair in touching), (q, touching)
+
+
+def test_high_fidelity_parts_may_meet_the_floor_and_each_other():
+    m = robot.load("high").mj_model
+    floor = m.geom("floor").id
+    parts = [i for i in np.flatnonzero(m.geom_contype) if i != floor]
+    limbs = ("thigh", "shank", "foot", "upper_arm", "forearm", "hand")
+    expected = {f"{side}_{limb}" for side in ("left", "right") for limb in limbs}
+    assert {m.geom(i).name for i in parts} >= expected | {"torso", "pelvis", "head"}
+    for i in parts:
+        assert m.geom_contype[i] & m.geom_conaffinity[floor]
+        assert all(m.geom_contype[i] & m.geom_conaffinity[j] for j in parts)
+
+
+@pytest.mark.parametrize("fidelity", ["train", "high"])
+def test_only_at_high_fidelity_a_fallen_robot_lies_on_its_trunk(fidelity):
+    r = robot.load(fidelity)
+    data = mujoco.MjData(r.mj_model)
+    data.qpos[:] = r.default_qpos
+    data.qpos[2:7] = 0.05, np.sqrt(0.5), 0, -np.sqrt(0.5), 0  # on its back
+    mujoco.mj_forward(r.mj_model, data)
+    trunk = {"torso", "pelvis"}
+    met = trunk & {r.mj_model.geom(i).name for i in data.contact.geom.ravel()}
+    assert met == (trunk if fidelity == "high" else set())
 
 
 def test_high_fidelity_floor_meets_all_parts():
@@ -224,7 +387,7 @@ def test_high_fidelity_floor_meets_all_parts():
 
 @pytest.mark.parametrize("fidelity", ["train", "high"])
 def test_stands_on_its_feet(fidelity):
-    """Servos at zero for 0.3 s: still upright; the touch sensors' impulse is the momentum gained."""
+    """Servos at zero for 0.3 s: still upright; the soles' impulse is the momentum gained."""
     r = robot.load(fidelity)
     data = mujoco.MjData(r.mj_model)
     data.qpos[:] = r.default_qpos
@@ -256,3 +419,24 @@ def test_mirrored_joints_give_the_mirrored_robot(xbot):
         partner = m.body(("right_" if side == "left" else "left_") + rest).id
         expected = here.xpos[i] * [1, -1, 1]
         np.testing.assert_allclose(there.xpos[partner], expected, atol=1e-4)
+
+
+def test_mirrored_motion_is_the_mirror_image(xbot, poses):
+    """Velocities negate y, angular velocities x and z; the joint limits mirror too."""
+    permutation, sign = robot.mirror_joints()
+    np.testing.assert_array_equal(sign * xbot.joint_upper[permutation], xbot.joint_lower)
+    m, rates = xbot.mj_model, np.random.default_rng(6).normal(size=(len(poses), 16))
+
+    def velocity(q, dq, name):
+        data, result = at_origin(m, q), np.zeros(6)
+        data.qvel[6:] = dq
+        mujoco.mj_forward(m, data)
+        body = m.body(name).id
+        mujoco.mj_objectVelocity(m, data, mujoco.mjtObj.mjOBJ_XBODY, body, result, 0)
+        return result
+
+    for q, dq in zip(poses, rates, strict=True):
+        image = q[permutation] * sign, dq[permutation] * sign
+        for link in ("ankle_roll_link", "knee_link", "elbow_pitch_link"):
+            expected = velocity(q, dq, f"left_{link}") * [-1, 1, -1, 1, -1, 1]
+            np.testing.assert_allclose(velocity(*image, f"right_{link}"), expected, atol=1e-3)

@@ -1,0 +1,81 @@
+"""Hand-made states: one robot standing upright at rest, with named changes."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from kslc_jax.commands import Command
+from kslc_jax.gait import GaitState
+from kslc_jax.signals import Signals
+
+
+def _fill(cls: type, defaults: dict[str, Any], changes: dict[str, Any]) -> Any:
+    unknown = set(changes) - {f.name for f in dataclasses.fields(cls)}
+    assert not unknown, f"{cls.__name__} has no {unknown}"
+    return cls(**{name: _array(value) for name, value in {**defaults, **changes}.items()})
+
+
+def _array(value: Any) -> Any:
+    value = np.asarray(value)
+    return jnp.asarray(value, bool if value.dtype == bool else jnp.float32)
+
+
+def make_signals(**changes: Any) -> Signals:
+    """Base 0.89 m above the soles, feet 0.3 m and knees 0.22 m apart, both feet on the ground."""
+    defaults = dict(
+        joint_pos=np.zeros(16),
+        joint_vel=np.zeros(16),
+        torque=np.zeros(16),
+        base_pos=[0.0, 0.0, 0.89],
+        base_quat=[1.0, 0.0, 0.0, 0.0],
+        base_euler=np.zeros(3),
+        base_linvel=np.zeros(3),
+        base_angvel=np.zeros(3),
+        base_velocity=np.zeros(6),
+        gravity=[0.0, 0.0, -1.0],
+        foot_pos=[[0.0, 0.15, 0.05], [0.0, -0.15, 0.05]],
+        foot_vel=np.zeros((2, 3)),
+        knee_pos=[[0.0, 0.11, 0.4], [0.0, -0.11, 0.4]],
+        foot_force=[260.0, 260.0],
+        foot_contact=[True, True],
+        angular_momentum=np.zeros(3),
+        torso_contact=False,
+    )
+    return _fill(Signals, defaults, changes)
+
+
+def make_gait(**changes: Any) -> GaitState:
+    """Phase 0: both feet are to stand, and do."""
+    defaults = dict(
+        phase=0.0,
+        contact=[True, True],
+        lift_z=[0.05, 0.05],
+        air_time=[0.0, 0.0],
+        landing=[0.0, 0.0],
+        swing_height=[0.0, 0.0],
+        stance=[True, True],
+        clock=[0.0, 1.0],
+    )
+    return _fill(GaitState, defaults, changes)
+
+
+def make_command(**changes: Any) -> Command:
+    """Zero velocity, with the clock running."""
+    return _fill(Command, dict(velocity=np.zeros(3), heading=0.0, moving=True), changes)
+
+
+def joints(**values: float) -> np.ndarray:
+    """[16] with the named joints' values, by hand-written index."""
+    order = [
+        *("left_leg_roll", "left_leg_yaw", "left_leg_pitch", "left_knee"),
+        *("left_ankle_pitch", "left_ankle_roll"),
+        *("right_leg_roll", "right_leg_yaw", "right_leg_pitch", "right_knee"),
+        *("right_ankle_pitch", "right_ankle_roll"),
+        *("left_shoulder_pitch", "left_elbow_pitch", "right_shoulder_pitch", "right_elbow_pitch"),
+    ]
+    out = np.zeros(16)
+    for name, value in values.items():
+        out[order.index(name)] = value
+    return out

@@ -1,0 +1,191 @@
+"""One environment: what a reset leaves behind, how episodes end, what the actor sees."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import curriculum, env, observations, physics
+from kslc_jax.config import preset
+
+
+@pytest.fixture(scope="module")
+def setting():
+    """Debug preset, without noise, delay and pushes; jitted reset and step."""
+    base = preset("debug")
+    config = dataclasses.replace(
+        base,
+        env=dataclasses.replace(base.env, noise_level=0.0, action_delay=0.0, action_noise=0.0),
+        randomize=dataclasses.replace(base.randomize, push_seconds=0.0),
+    )
+    cur = curriculum.init(config)
+    reset = jax.jit(lambda key: env.reset(config, key, cur))
+    step = jax.jit(lambda state, action, key: env.step(config, state, action, key, cur))
+    return config, reset, step
+
+
+def test_reset_is_all_that_a_new_episode_is_made_of(setting):
+    """A step that ends an episode returns exactly reset(its key): no field of the old one."""
+    _config, reset, step = setting
+    state = reset(jax.random.key(0))
+    for i in range(5):
+        state, _ = step(state, jnp.ones(16), jax.random.key(i))
+    fallen = state.replace(physics=state.physics.replace(qpos=state.physics.qpos.at[2].set(0.05)))
+    key = jax.random.key(7)
+    new, outcome = step(fallen, jnp.ones(16), key)
+    assert bool(outcome.terminated) and not bool(outcome.truncated)
+    fresh = reset(jax.random.split(key, 5)[4])
+    for a, b in zip(jax.tree.leaves(new), jax.tree.leaves(fresh), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+
+
+def test_history_is_zero_after_a_reset_but_for_the_newest_frame(setting):
+    _, reset, _ = setting
+    state = reset(jax.random.key(0))
+    assert not np.any(state.history[:-1]) and np.any(state.history[-1])
+    assert not np.any(state.privileged_history[:-1]) and np.any(state.privileged_history[-1])
+    assert state.history.shape[1] == 59 and state.privileged_history.shape[1] == 89
+
+
+def test_time_limit_truncates(setting):
+    config, reset, step = setting
+    state = reset(jax.random.key(0))
+    late = state.replace(time=jnp.asarray(config.episode_steps - 1))
+    new, outcome = step(late, jnp.zeros(16), jax.random.key(1))
+    assert bool(outcome.truncated) and not bool(outcome.terminated)
+    assert int(new.time) == 0 and int(outcome.episode_steps) == config.episode_steps
+    new, outcome = step(state, jnp.zeros(16), jax.random.key(1))
+    assert not bool(outcome.truncated) and int(new.time) == 1
+
+
+def test_broken_physics_is_masked_and_reset(setting):
+    _, reset, step = setting
+    state = reset(jax.random.key(0))
+    bad = state.replace(physics=state.physics.replace(qvel=state.physics.qvel.at[8].set(jnp.nan)))
+    new, outcome = step(bad, jnp.zeros(16), jax.random.key(1))
+    assert bool(outcome.broken) and bool(outcome.terminated)
+    assert float(outcome.reward) == 0.0 and int(new.time) == 0
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(new))
+
+
+def test_action_becomes_the_joint_target(setting):
+    """Without delay and noise the servo pulls towards 0.25 rad x action."""
+    _, reset, step = setting
+    state = reset(jax.random.key(0))
+    action = jnp.zeros(16).at[12].set(2.0)
+    for i in range(60):
+        state, _ = step(state, action, jax.random.key(i))
+    assert float(state.physics.qpos[7 + 12]) == pytest.approx(0.5, abs=0.05)
+    np.testing.assert_allclose(state.last_action, action)
+
+
+def test_delay_and_noise(debug):
+    """(1 - d) a + d a_prev with d <= 0.5, times 1 + 0.02 n; clipped at 18 before."""
+    keys = jax.random.split(jax.random.key(0), 4000)
+    apply = jax.vmap(lambda k: env._applied_action(debug, jnp.full(16, 30.0), jnp.zeros(16), k))
+    applied = apply(keys)
+    assert float(applied.max()) < 18.0 * 1.1
+    per_env = applied.mean(axis=1)  # noise averages out over joints, the delay is per environment
+    assert per_env.min() == pytest.approx(9.0, abs=0.4)
+    assert per_env.max() == pytest.approx(18.0, abs=0.4)
+    assert float(jnp.mean(jnp.std(applied, axis=1) / per_env)) == pytest.approx(0.02, abs=0.002)
+
+
+def test_held_arms_ignore_actions(debug):
+    held = dataclasses.replace(debug, env=dataclasses.replace(debug.env, arms="held"))
+    applied = env._applied_action(held, jnp.ones(16), jnp.ones(16), jax.random.key(0))
+    assert not np.any(applied[12:]) and np.all(applied[:12])
+
+
+@pytest.mark.parametrize("adds", [True, False])
+def test_pushes(debug, adds):
+    """Every 4 s, within U(-0.2, 0.2) m/s and U(-0.4, 0.4) rad/s; added, or set as HG does."""
+    config = dataclasses.replace(
+        debug, randomize=dataclasses.replace(debug.randomize, push_adds=adds)
+    )
+    state = env.reset(config, jax.random.key(0), curriculum.init(config))
+    velocity = jnp.full(22, 3.0)
+    state = state.replace(physics=state.physics.replace(qvel=velocity))
+    off = env._push(config, state.replace(time=jnp.asarray(399)), jax.random.key(1))
+    np.testing.assert_array_equal(off.physics.qvel, velocity)
+    on = env._push(config, state.replace(time=jnp.asarray(400)), jax.random.key(1))
+    pushed = on.physics.qvel - (velocity if adds else 0.0)
+    assert np.all(np.abs(pushed[:2]) <= 0.2) and np.all(np.abs(pushed[3:6]) <= 0.4)
+    assert np.any(pushed[:2]) and np.any(pushed[3:6])
+    np.testing.assert_allclose(on.push[:2], pushed[:2], atol=1e-6)
+    np.testing.assert_array_equal(on.physics.qvel[6:], velocity[6:])
+    assert float(on.physics.qvel[2]) == 3.0
+
+
+def test_commands_are_resampled_every_8_seconds(setting):
+    _config, reset, step = setting
+    state = reset(jax.random.key(3))
+    command = state.command.velocity[:2]
+    for time, changes in ((798, False), (799, True)):
+        new, _ = step(state.replace(time=jnp.asarray(time)), jnp.zeros(16), jax.random.key(4))
+        assert bool(jnp.any(new.command.velocity[:2] != command)) == changes
+
+
+def test_jit_equals_no_jit_and_batch_of_one():
+    """float32 fusions reorder sums: 1e-5."""
+    config = preset("debug")
+    cur = curriculum.init(config)
+    state = env.reset(config, jax.random.key(0), cur)
+    args = state, 0.1 * jnp.ones(16), jax.random.key(1)
+    plain = env.step(config, *args, cur)
+    jitted = jax.jit(lambda s, a, k: env.step(config, s, a, k, cur))(*args)
+    one = jax.vmap(lambda s, a, k: env.step(config, s, a, k, cur))(
+        *jax.tree.map(lambda x: x[None], args)
+    )
+    for a, b, c in zip(*map(jax.tree.leaves, (plain, jitted, one)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(b, c[0], rtol=1e-4, atol=1e-4)
+
+
+def test_engines_give_the_same_environment():
+    """The same 10 steps through mjx and mujoco: frames agree to 1e-3."""
+    frames = []
+    for engine in ("mjx", "mujoco"):
+        base = preset("debug")
+        config = dataclasses.replace(base, physics=dataclasses.replace(base.physics, engine=engine))
+        cur = curriculum.init(config)
+        state = env.reset(config, jax.random.key(0), cur)
+        step = jax.jit(lambda s, a, k, c=config, u=cur: env.step(c, s, a, k, u))
+        for i in range(10):
+            state, outcome = step(state, jnp.sin(jnp.arange(16.0) + i), jax.random.key(i))
+        frames.append((state.privileged_history[-1], outcome.reward))
+    np.testing.assert_allclose(frames[0][0], frames[1][0], atol=1e-3)
+    assert float(frames[0][1]) == pytest.approx(float(frames[1][1]), abs=1e-4)
+
+
+def test_torso_contact_ends_the_episode(xbot):
+    """The 0.4 m box centred 0.1 m above the base origin: upright it touches below 0.1 m."""
+    config = preset("debug").physics
+    from kslc_jax import signals
+
+    def contact(height, quat=(1.0, 0.0, 0.0, 0.0)):
+        qpos = jnp.asarray(xbot.default_qpos).at[2].set(height).at[3:7].set(jnp.array(quat))
+        state = physics.initial_state(config, qpos, jnp.zeros(22))
+        return bool(signals.read(xbot, state).torso_contact)
+
+    assert not contact(0.11) and contact(0.09)
+    lying = (0.70710678, 0.70710678, 0.0, 0.0)  # rolled by 90 degrees: half width 0.2
+    assert not contact(0.21, lying) and contact(0.19, lying)
+
+
+def test_frames_hold_what_the_state_holds(setting):
+    """Actor and critic frames of a reset state, component by component."""
+    _config, reset, _ = setting
+    state = reset(jax.random.key(5))
+    actor = {n: state.history[-1][s] for n, s in observations.slices(observations.ACTOR).items()}
+    np.testing.assert_allclose(actor["joint_pos"], state.physics.qpos[7:], atol=1e-6)
+    np.testing.assert_allclose(
+        actor["command"], state.command.velocity * jnp.array([2.0, 2.0, 1.0]), atol=1e-6
+    )
+    at = observations.slices(observations.CRITIC)
+    critic = {n: state.privileged_history[-1][s] for n, s in at.items()}
+    np.testing.assert_allclose(critic["friction"][0], state.dynamics.friction, rtol=1e-6)
+    mass = 21.081917 + state.dynamics.base_mass
+    np.testing.assert_allclose(critic["base_mass"][0], mass / 30.0, rtol=1e-5)

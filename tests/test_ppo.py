@@ -1,0 +1,190 @@
+"""PPO against numbers worked out by hand, and on a problem whose optimum is known."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import ppo
+from kslc_jax.config import PPOConfig
+from kslc_jax.networks import Gaussian
+
+CONFIG = PPOConfig()
+
+
+class TestGAE:
+    """gamma 0.5, lambda 0.5 keep the arithmetic visible."""
+
+    def gae(self, reward, value, last, done, truncated):
+        to = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+        args = to(reward), to(value), to(last), jnp.asarray(done), jnp.asarray(truncated)
+        return ppo.gae(*args, 0.5, 0.5)
+
+    def test_by_hand(self):
+        # delta_2 = 3 + 0.5*8 - 2 = 5; delta_1 = 2 + 0.5*2 - 4 = -1; delta_0 = 1 + 0.5*4 - 1 = 2
+        # A_2 = 5; A_1 = -1 + 0.25*5 = 0.25; A_0 = 2 + 0.25*0.25 = 2.0625
+        no = [False] * 3
+        advantage, target = self.gae([1, 2, 3], [1, 4, 2], 8, no, no)
+        np.testing.assert_allclose(advantage, [2.0625, 0.25, 5.0])
+        np.testing.assert_allclose(target, [3.0625, 4.25, 7.0])
+
+    def test_termination_cuts_value_and_trace(self):
+        # delta_1 = 2 - 4 = -2 (nothing behind it); delta_0 = 1 + 0.5*4 - 1 = 2
+        # A_1 = -2; A_0 = 2 + 0.25*(-2) = 1.5
+        advantage, _ = self.gae([1, 2, 3], [1, 4, 2], 8, [False, True, False], [False] * 3)
+        np.testing.assert_allclose(advantage, [1.5, -2.0, 5.0])
+
+    def test_time_out_is_worth_its_value(self):
+        # r_1 gains 0.5*4: delta_1 = 4 - 4 = 0; A_0 = 2 + 0
+        end = [False, True, False]
+        advantage, _ = self.gae([1, 2, 3], [1, 4, 2], 8, end, end)
+        np.testing.assert_allclose(advantage, [2.0, 0.0, 5.0])
+
+    def test_against_the_definition(self):
+        """A_t = sum_k (gamma lam)^k delta_{t+k} up to the episode's end, summed the slow way."""
+        rng = np.random.default_rng(0)
+        t, gamma, lam = 50, 0.994, 0.9
+        reward, value, last = rng.normal(size=t), rng.normal(size=t), rng.normal()
+        done = rng.random(t) < 0.1
+        following = np.append(value[1:], last)
+        delta = reward + gamma * following * ~done - value
+        slow = np.zeros(t)
+        for i in range(t):
+            for k in range(i, t):
+                slow[i] += (gamma * lam) ** (k - i) * delta[k]
+                if done[k]:
+                    break
+        none = jnp.zeros(t, bool)
+        args = jnp.asarray(reward), jnp.asarray(value), jnp.asarray(last), jnp.asarray(done)
+        advantage, target = jax.jit(ppo.gae)(*args, none, gamma, lam)
+        np.testing.assert_allclose(advantage, slow, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(target, slow + value, rtol=1e-4, atol=1e-5)
+
+
+class TestGaussian:
+    OLD = Gaussian(jnp.array([0.0, 1.0]), jnp.log(jnp.array([1.0, 2.0])))
+
+    def test_log_prob(self):
+        # -z^2/2 - log s - log(2 pi)/2 with z = 1, 0.5 and s = 1, 2
+        expected = -0.5 - 0.125 - np.log(2) - np.log(2 * np.pi)
+        assert self.OLD.log_prob(jnp.array([1.0, 2.0])) == pytest.approx(expected)
+
+    def test_entropy(self):
+        assert self.OLD.entropy() == pytest.approx(np.log(2) + np.log(2 * np.pi) + 1)
+
+    def test_kl_by_hand_and_by_sampling(self):
+        new = Gaussian(jnp.array([1.0, 1.0]), jnp.zeros(2))
+        # first: mean moved by 1 with s 1: 1/2; second: log(1/2) + 4/2 - 1/2
+        expected = 0.5 + np.log(0.5) + 1.5
+        assert new.kl_from(self.OLD) == pytest.approx(expected)
+        keys = jax.random.split(jax.random.key(0), 100_000)
+        x = jax.vmap(self.OLD.sample)(keys)
+        sampled = jnp.mean(self.OLD.log_prob(x) - new.log_prob(x))
+        assert sampled == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("kl", "factor"), [(0.03, 1 / 1.5), (0.015, 1.0), (0.004, 1.5), (0.0, 1.0)]
+)
+def test_learning_rate_follows_the_kl(kl, factor):
+    rate = ppo.adapt_learning_rate(CONFIG, jnp.asarray(1e-4), jnp.asarray(kl))
+    assert rate == pytest.approx(1e-4 * factor)
+
+
+def test_learning_rate_stays_in_bounds():
+    low, high = CONFIG.learning_rate_bounds
+    assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(low), jnp.asarray(1.0)) == pytest.approx(low)
+    assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(high), jnp.asarray(1e-5)) == pytest.approx(
+        high
+    )
+
+
+def samples(**changes):
+    base = ppo.Samples(
+        index=jnp.arange(2),
+        action=jnp.zeros((2, 1)),
+        mean=jnp.zeros((2, 1)),
+        log_prob=jnp.full(2, -0.9189385),  # log N(0; 0, 1)
+        value=jnp.zeros(2),
+        advantage=jnp.array([1.0, -1.0]),
+        target=jnp.array([1.0, 2.0]),
+        valid=jnp.ones(2, bool),
+    )
+    return base.replace(**changes)
+
+
+def bandit_apply(params, index):
+    """Policy and value that do not look at the observation."""
+    mean = jnp.broadcast_to(params["mean"], (index.shape[0], 1))
+    return Gaussian(mean, params["log_std"]), jnp.broadcast_to(params["value"], index.shape)
+
+
+def params(mean=0.0, value=0.0):
+    return {"mean": jnp.asarray(mean), "log_std": jnp.zeros(1), "value": jnp.asarray(value)}
+
+
+class TestLoss:
+    def loss(self, params, batch):
+        return ppo.loss(CONFIG, bandit_apply, jnp.zeros(1), params, batch)[1]
+
+    def test_ratio_one(self):
+        info = self.loss(params(), samples())
+        assert info["policy_loss"] == pytest.approx(0.0, abs=1e-6)  # -(1 - 1) / 2
+        assert info["kl"] == pytest.approx(0.0, abs=1e-6)
+
+    def test_ratio_is_clipped(self):
+        # mean 1: ratio = exp(-1/2) = 0.6065; min(0.6065 * 1, 0.8) and min(-0.6065, -0.8)
+        info = self.loss(params(mean=1.0), samples())
+        assert info["policy_loss"] == pytest.approx(-(0.60653 - 0.8) / 2, abs=1e-4)
+        assert info["clip_share"] == pytest.approx(1.0)
+        assert info["kl"] == pytest.approx(0.5)
+
+    def test_value_is_clipped(self):
+        # value 1, old 0: clipped to 0.2; max((1-1)^2, 0.8^2) and max(1, 1.8^2), mean
+        info = self.loss(params(value=1.0), samples())
+        assert info["value_loss"] == pytest.approx((0.64 + 3.24) / 2)
+
+    def test_invalid_samples_do_not_count(self):
+        one = samples(valid=jnp.array([True, False]), target=jnp.array([1.0, 1e6]))
+        assert self.loss(params(), one)["value_loss"] == pytest.approx(1.0)
+
+
+def test_non_finite_gradient_changes_nothing_and_is_counted():
+    learner = ppo.init(CONFIG, params())
+    bad = samples(target=jnp.array([jnp.nan, 1.0]))
+    new, info = ppo.gradient_step(CONFIG, bandit_apply, jnp.zeros(1), learner, bad)
+    chex.assert_trees_all_equal(new, learner)
+    assert info["skipped"] == 1.0
+
+
+def test_update_finds_the_best_action_of_a_bandit():
+    """Reward -(a - 2)^2: the mean moves from 0 to 2, the value to the reward's mean."""
+    config = PPOConfig(learning_rate=1e-2, minibatches=4, epochs=4, entropy_coef=0.0)
+    learner = ppo.init(config, params())
+
+    @jax.jit
+    def iterate(learner, key):
+        key_act, key_update = jax.random.split(key)
+        size = 512
+        index = jnp.arange(size)
+        dist, value = bandit_apply(learner.params, index)
+        action = dist.sample(key_act)
+        reward = -jnp.square(action[:, 0] - 2.0)
+        batch = ppo.Samples(
+            index,
+            action,
+            dist.mean,
+            dist.log_prob(action),
+            value,
+            reward - value,
+            reward,
+            index >= 0,
+        )
+        log_std = learner.params["log_std"]
+        return ppo.update(config, bandit_apply, log_std, learner, batch, key_update)[0]
+
+    for key in jax.random.split(jax.random.key(0), 150):
+        learner = iterate(learner, key)
+    assert learner.params["mean"] == pytest.approx(2.0, abs=0.15)
+    assert jnp.exp(learner.params["log_std"][0]) < 0.6

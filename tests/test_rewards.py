@@ -1,0 +1,606 @@
+"""Every reward term against numbers worked out by hand, and the readings of unclear equations."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from states import joints, make_command, make_gait, make_signals
+
+from kslc_jax import observations, ppo, rewards, robot
+from kslc_jax.commands import Command
+from kslc_jax.config import PPOConfig, RewardConfig, RewardWeights, preset
+from kslc_jax.gait import GaitState
+from kslc_jax.signals import Signals
+
+DT = 0.01
+KSLC = preset("paper").rewards
+HG = preset("baseline").rewards
+LATERAL = dataclasses.replace(KSLC, lateral_distance=True)
+LEAN = dataclasses.replace(KSLC, lean_per_speed=0.1)
+LOOSE = dataclasses.replace(
+    KSLC, momentum_scale=10.0, clearance_width=0.03, base_height_kernel=30.0
+)
+
+# Humanoid-Gym's table, typed in by hand.
+HUMANOID_GYM = {
+    "joint_pos": 1.6,
+    "feet_clearance": 1.0,
+    "feet_contact_number": 1.2,
+    "feet_air_time": 1.0,
+    "foot_slip": -0.05,
+    "feet_distance": 0.2,
+    "knee_distance": 0.2,
+    "feet_contact_forces": -0.01,
+    "tracking_lin_vel": 1.2,
+    "tracking_ang_vel": 1.1,
+    "vel_mismatch_exp": 0.5,
+    "low_speed": 0.2,
+    "track_vel_hard": 0.5,
+    "default_joint_pos": 0.5,
+    "orientation": 1.0,
+    "base_height": 0.2,
+    "base_acc": 0.2,
+    "action_smoothness": -0.002,
+    "torques": -1e-5,
+    "dof_vel": -5e-4,
+    "dof_acc": -1e-7,
+    "collision": -1.0,
+}
+
+
+def names(cls: type) -> set[str]:
+    return {f.name for f in dataclasses.fields(cls)}
+
+
+def make_inputs(**changes: Any) -> rewards.Inputs:
+    """A robot standing at rest under a zero command; `vx`, and any field of any part, by name."""
+    if "vx" in changes:
+        changes["velocity"] = [changes.pop("vx"), 0.0, 0.0]
+
+    def take(cls: type) -> dict[str, Any]:
+        return {n: changes.pop(n) for n in names(cls) & set(changes)}
+
+    parts = (
+        make_signals(**take(Signals)),
+        make_gait(**take(GaitState)),
+        make_command(**take(Command)),
+    )
+    rest = dict(
+        reference=np.zeros(16),
+        action=np.zeros(16),
+        last_action=np.zeros(16),
+        last_last_action=np.zeros(16),
+        last_joint_vel=np.zeros(16),
+        last_base_velocity=np.zeros(6),
+        v_max=3.5,
+    )
+    assert set(changes) <= set(rest), f"unknown: {set(changes) - set(rest)}"
+    arrays = {name: jnp.asarray(value, jnp.float32) for name, value in {**rest, **changes}.items()}
+    return rewards.Inputs(*parts, **arrays)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def evaluate(cfg: RewardConfig, x: rewards.Inputs):
+    return rewards.evaluate(cfg, robot.load(), DT, x)
+
+
+def value(cfg: RewardConfig, term: str, x: rewards.Inputs) -> float:
+    return float(rewards.TERMS[term](cfg, robot.load(), DT, x))
+
+
+# term, config, changes, expected. e^-1 = 0.367879, e^-2 = 0.135335, e^-5 = 0.006738.
+CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
+    # |L| = 5, scale 5: 1 - e^1; |L| = 15: 1 - e^3; |L| = 100: 1 - e^20, floor -20.
+    ("angular_momentum", KSLC, {}, 0.0),
+    ("angular_momentum", KSLC, {"angular_momentum": [3.0, 0.0, 4.0]}, -1.7182818),
+    ("angular_momentum", KSLC, {"angular_momentum": [0.0, -15.0, 0.0]}, -19.085537),
+    ("angular_momentum", KSLC, {"angular_momentum": [0.0, 0.0, 100.0]}, -20.0),
+    ("angular_momentum", KSLC, {"angular_momentum": [0.0, 0.0, 1e6]}, -20.0),
+    # |L| = 5, scale 10: 1 - e^0.5.
+    ("angular_momentum", LOOSE, {"angular_momentum": [3.0, 0.0, 4.0]}, -0.64872127),
+    # Feet at 0.05: height is base z. Error 0.01: e^-1.
+    ("base_height", KSLC, {}, 1.0),
+    ("base_height", KSLC, {"base_pos": [5.0, 5.0, 0.90]}, 0.36787944),
+    # g = 0.5: target 0.89 (1 - 0.05 / 2) = 0.86775, error 0.01; backwards the same.
+    ("base_height", KSLC, {"vx": 1.75, "base_pos": [0, 0, 0.87775]}, 0.36787944),
+    ("base_height", KSLC, {"vx": -1.75, "base_pos": [0, 0, 0.87775]}, 0.36787944),
+    # g is relative to the curriculum: 1 / 2.
+    ("base_height", KSLC, {"vx": 1.0, "v_max": 2.0, "base_pos": [0, 0, 0.85775]}, 0.36787944),
+    # g at most 1: target 0.8455.
+    ("base_height", KSLC, {"vx": 5.0, "base_pos": [0, 0, 0.8455]}, 1.0),
+    # Kernel 30, error 0.1: e^-3.
+    ("base_height", LOOSE, {"base_pos": [0, 0, 0.79]}, 0.04978707),
+    # Fixed target: error 0.01225, e^-1.225.
+    ("base_height", HG, {"vx": 1.75, "base_pos": [0, 0, 0.87775]}, 0.29375770),
+    # A swing foot in the air does not count; two stance feet give the mean: 0.06 - 0.05 = 0.01.
+    (
+        "base_height",
+        HG,
+        {"stance": [True, False], "foot_pos": [[0, 0.15, 0.05], [0, -0.15, 0.3]]},
+        1.0,
+    ),
+    (
+        "base_height",
+        HG,
+        {"foot_pos": [[0, 0.15, 0.05], [0, -0.15, 0.07]], "base_pos": [0, 0, 0.91]},
+        0.36787944,
+    ),
+    # Only swing feet count. Target 0.06 (1 + g), width 0.01.
+    ("feet_clearance", KSLC, {"swing_height": [0.06, 0.06]}, 0.0),
+    ("feet_clearance", KSLC, {"swing_height": [0.06, 0.06], "stance": [False, True]}, 1.0),
+    ("feet_clearance", KSLC, {"swing_height": [0.06, 0.05], "stance": [True, False]}, 0.36787944),
+    ("feet_clearance", KSLC, {"swing_height": [0.06, 0.07], "stance": [False] * 2}, 1.36787944),
+    # g = 1: 0.12; g = 0.5: 0.09.
+    (
+        "feet_clearance",
+        KSLC,
+        {"vx": 3.5, "swing_height": [0.11, 0], "stance": [False, True]},
+        0.36787944,
+    ),
+    (
+        "feet_clearance",
+        KSLC,
+        {"vx": 1.75, "swing_height": [0.10, 0], "stance": [False, True]},
+        0.36787944,
+    ),
+    ("feet_clearance", KSLC, {"swing_height": [1.0, 0], "stance": [False, True]}, 0.0),
+    # Width 0.03, error 0.03.
+    ("feet_clearance", LOOSE, {"swing_height": [0.09, 0], "stance": [False, True]}, 0.36787944),
+    # HG: a window of +-0.01 around 0.06 at every speed.
+    ("feet_clearance", HG, {"swing_height": [0.069, 0], "stance": [False, True]}, 1.0),
+    ("feet_clearance", HG, {"swing_height": [0.071, 0], "stance": [False, True]}, 0.0),
+    ("feet_clearance", HG, {"swing_height": [0.049, 0], "stance": [False, True]}, 0.0),
+    (
+        "feet_clearance",
+        HG,
+        {"vx": 3.5, "swing_height": [0.055, 0.06], "stance": [False] * 2},
+        2.0,
+    ),
+    # n = 0.5: e^-1 - 0.2 * 0.5; n = 1: e^-2 - 0.2 * 0.5 (clip); n = 0.25: e^-0.5 - 0.05.
+    ("joint_pos", HG, {}, 1.0),
+    ("joint_pos", HG, {"joint_pos": joints(left_knee=0.3, right_elbow_pitch=-0.4)}, 0.26787944),
+    ("joint_pos", HG, {"joint_pos": joints(left_knee=0.6, right_knee=0.8)}, 0.03533528),
+    ("joint_pos", HG, {"joint_pos": joints(left_knee=0.15, right_knee=0.2)}, 0.55653066),
+    (
+        "joint_pos",
+        HG,
+        {"joint_pos": joints(left_knee=-0.1), "reference": joints(left_knee=-0.6)},
+        0.26787944,
+    ),
+    (
+        "joint_pos",
+        HG,
+        {"joint_pos": joints(left_knee=0.5), "joint_vel": np.full(16, 9.0)},
+        0.26787944,
+    ),
+    # KSLC at rest is HG's. At the speed limit (legs 12, arms 7 rad/s) the error counts e^-1:
+    # n = 0.5 * 0.367879 = 0.183940; e^(-2 n) - 0.2 n = 0.692201 - 0.036788.
+    ("joint_pos", KSLC, {"joint_pos": joints(left_knee=0.3, right_knee=0.4)}, 0.26787944),
+    (
+        "joint_pos",
+        KSLC,
+        {"joint_pos": joints(left_knee=0.5), "joint_vel": joints(left_knee=-12.0)},
+        0.65541268,
+    ),
+    (
+        "joint_pos",
+        KSLC,
+        {"joint_pos": joints(left_elbow_pitch=0.5), "joint_vel": joints(left_elbow_pitch=7.0)},
+        0.65541268,
+    ),
+    (  # another joint's speed does not matter
+        "joint_pos",
+        KSLC,
+        {"joint_pos": joints(left_knee=0.5), "joint_vel": joints(right_knee=12.0)},
+        0.26787944,
+    ),
+    # e^2 = 0.1^2 + 0.2^2 = 0.05: e^-0.25. Vertical speed does not count.
+    (
+        "tracking_lin_vel",
+        KSLC,
+        {"velocity": [1.0, 0.5, 0.3], "base_linvel": [1.1, 0.3, 2.0]},
+        0.77880078,
+    ),
+    # e^2 = 0.04: e^-0.2.
+    (
+        "tracking_ang_vel",
+        KSLC,
+        {"velocity": [1.0, 0.5, 0.5], "base_angvel": [1.0, 2.0, 0.3]},
+        0.81873075,
+    ),
+    # vz 0.2: e^-0.4 = 0.670320; |w_xy| 0.5: e^-2.5 = 0.082085; mean.
+    (
+        "vel_mismatch_exp",
+        KSLC,
+        {"base_linvel": [3.0, 3.0, -0.2], "base_angvel": [0.3, 0.4, 5.0]},
+        0.37620252,
+    ),
+    ("low_speed", KSLC, {"vx": 2.0, "base_linvel": [0.9, 0, 0]}, -1.0),
+    ("low_speed", KSLC, {"vx": 2.0, "base_linvel": [1.1, 0, 0]}, 1.2),
+    ("low_speed", KSLC, {"vx": 2.0, "base_linvel": [2.3, 0, 0]}, 1.2),
+    ("low_speed", KSLC, {"vx": 2.0, "base_linvel": [2.5, 0, 0]}, 0.0),
+    ("low_speed", KSLC, {"vx": 2.0, "base_linvel": [-2.0, 0, 0]}, -2.0),
+    ("low_speed", KSLC, {"vx": 2.0, "base_linvel": [0.0, 2.0, 0]}, -2.0),
+    ("low_speed", KSLC, {"vx": -0.3, "base_linvel": [-0.3, 0, 0]}, 1.2),
+    ("low_speed", KSLC, {"vx": -0.3, "base_linvel": [-0.1, 0, 0]}, -1.0),
+    ("low_speed", KSLC, {"vx": 0.05, "base_linvel": [-1.0, 0, 0]}, 0.0),
+    ("low_speed", KSLC, {"velocity": [0.0, 0.3, 0.0], "base_linvel": [1.0, 0, 0]}, 0.0),
+    # e_xy = 0.5, e_yaw = 0.2: (e^-5 + e^-2) / 2 - 0.2 * 0.7 = 0.0710366 - 0.14.
+    (
+        "track_vel_hard",
+        KSLC,
+        {
+            "velocity": [1.0, 0.0, 0.5],
+            "base_linvel": [0.7, 0.4, 9.0],
+            "base_angvel": [9.0, 9.0, 0.3],
+        },
+        -0.06896338,
+    ),
+    ("track_vel_hard", KSLC, {}, 1.0),
+    ("feet_contact_number", KSLC, {}, 1.0),
+    ("feet_contact_number", KSLC, {"stance": [True, False], "foot_contact": [True, True]}, 0.35),
+    ("feet_contact_number", KSLC, {"stance": [True, False], "foot_contact": [False, True]}, -0.3),
+    ("feet_air_time", KSLC, {"landing": [0.3, 0.0]}, 0.3),
+    ("feet_air_time", KSLC, {"landing": [0.7, 0.2]}, 0.7),  # 0.5 + 0.2
+    # sqrt(0.5) for the foot in contact; sqrt(1) more for the other.
+    (
+        "foot_slip",
+        KSLC,
+        {"foot_vel": [[0.3, 0.4, 5.0], [0.6, 0.8, 0.0]], "foot_contact": [True, False]},
+        0.70710678,
+    ),
+    ("foot_slip", KSLC, {"foot_vel": [[0.3, 0.4, 5.0], [0.6, 0.8, 0.0]]}, 1.70710678),
+    ("feet_contact_forces", KSLC, {"foot_force": [900.0, 650.0]}, 200.0),
+    ("feet_contact_forces", KSLC, {"foot_force": [1200.0, 701.0]}, 401.0),
+    # 0.05 too near or too far: (e^-5 + 1) / 2. Height does not count.
+    ("feet_distance", KSLC, {}, 1.0),
+    ("feet_distance", KSLC, {"foot_pos": [[0, 0.1, 0.05], [0, -0.05, 0.05]]}, 0.50336897),
+    ("feet_distance", KSLC, {"foot_pos": [[0, 0.3, 0.05], [0, -0.25, 0.05]]}, 0.50336897),
+    ("feet_distance", KSLC, {"foot_pos": [[0.3, 0.2, 0.05], [0, -0.2, 0.4]]}, 1.0),
+    # 0.6 ahead and 0.3 aside: in the plane 0.6708, (1 + e^-17.08) / 2; lateral 0.3.
+    ("feet_distance", KSLC, {"foot_pos": [[0.6, 0.15, 0.05], [0, -0.15, 0.05]]}, 0.50000002),
+    ("feet_distance", LATERAL, {"foot_pos": [[0.6, 0.15, 0.05], [0, -0.15, 0.05]]}, 1.0),
+    # Heading +y: aside is x.
+    (
+        "feet_distance",
+        LATERAL,
+        {"foot_pos": [[-0.3, 0.6, 0.05], [0, 0, 0.05]], "base_euler": [0, 0, np.pi / 2]},
+        1.0,
+    ),
+    (
+        "feet_distance",
+        LATERAL,
+        {"foot_pos": [[-0.15, 0.6, 0.05], [0, 0, 0.05]], "base_euler": [0, 0, np.pi / 2]},
+        0.50336897,
+    ),
+    # 0.01 outside 0.2 to 0.25: (1 + e^-1) / 2.
+    ("knee_distance", KSLC, {}, 1.0),
+    ("knee_distance", KSLC, {"knee_pos": [[0, 0.13, 0.4], [0, -0.13, 0.4]]}, 0.68393972),
+    ("knee_distance", KSLC, {"knee_pos": [[0, 0.095, 0.4], [0, -0.095, 0.4]]}, 0.68393972),
+    ("knee_distance", LATERAL, {"knee_pos": [[0.3, 0.12, 0.4], [0, -0.1, 0.4]]}, 1.0),
+    # norm(roll, yaw) = 0.15, 0.05 over: e^-5 - 0.01 * 0.15.
+    (
+        "default_joint_pos",
+        KSLC,
+        {"joint_pos": joints(left_leg_roll=0.09, left_leg_yaw=-0.12)},
+        0.00523795,
+    ),
+    (
+        "default_joint_pos",
+        KSLC,
+        {"joint_pos": joints(right_leg_roll=0.09, right_leg_yaw=0.12)},
+        0.00523795,
+    ),
+    # The norms of the two sides add up: 0.06 + 0.05 = 0.11; e^-1 - 0.01 sqrt(0.0061).
+    (
+        "default_joint_pos",
+        KSLC,
+        {"joint_pos": joints(left_leg_roll=0.06, right_leg_yaw=0.05)},
+        0.36709842,
+    ),
+    ("default_joint_pos", KSLC, {"joint_pos": joints(left_knee=0.3, left_elbow_pitch=0.4)}, 0.995),
+    # (e^(-10 * 0.1) + e^(-20 * 0.05)) / 2.
+    (
+        "orientation",
+        KSLC,
+        {"base_euler": [0.03, -0.07, 2.0], "gravity": [0.03, 0.04, -0.998749]},
+        0.36787944,
+    ),
+    # Leaning forward by 0.2: (e^-2 + e^(-20 sin 0.2)) / 2; free at 2 m/s if 0.1 rad per m/s.
+    (
+        "orientation",
+        KSLC,
+        {"vx": 2.0, "base_euler": [0, 0.2, 0], "gravity": [0.1986693, 0, -0.980067]},
+        0.07707253,
+    ),
+    (
+        "orientation",
+        LEAN,
+        {"vx": 2.0, "base_euler": [0, 0.2, 0], "gravity": [0.1986693, 0, -0.980067]},
+        1.0,
+    ),
+    # |change| = 0.3: e^-0.9.
+    (
+        "base_acc",
+        KSLC,
+        {"base_velocity": [1.1, 0, 0, 0, 0.2, 0], "last_base_velocity": [1, 0, -0.2, 0, 0, 0]},
+        0.40656966,
+    ),
+    ("collision", KSLC, {}, 0.0),
+    ("collision", KSLC, {"torso_contact": True}, 1.0),
+    # 0.5 + 0.1 * 2.
+    (
+        "stand_still",
+        KSLC,
+        {
+            "moving": False,
+            "joint_pos": joints(left_knee=0.3, right_knee=0.4),
+            "joint_vel": joints(left_knee=2.0),
+        },
+        0.7,
+    ),
+    ("stand_still", KSLC, {"joint_pos": joints(left_knee=0.3, right_knee=0.4)}, 0.0),
+    # 1 <- 0.5 <- 0.2: 0.5^2 + (1 + 0.2 - 1)^2 + 0.05; a constant -2: 0.05 * 2.
+    (
+        "action_smoothness",
+        KSLC,
+        {
+            "action": joints(left_knee=1.0, right_knee=-2.0),
+            "last_action": joints(left_knee=0.5, right_knee=-2.0),
+            "last_last_action": joints(left_knee=0.2, right_knee=-2.0),
+        },
+        0.44,
+    ),
+    ("torques", KSLC, {"torque": joints(left_knee=3.0, right_elbow_pitch=-4.0)}, 25.0),
+    ("dof_vel", KSLC, {"joint_vel": joints(left_knee=1.0, right_elbow_pitch=-2.0)}, 5.0),
+    # (0.2 / 0.01)^2 + (0.1 / 0.01)^2.
+    (
+        "dof_acc",
+        KSLC,
+        {
+            "joint_vel": joints(left_knee=0.5, right_knee=-0.1),
+            "last_joint_vel": joints(left_knee=0.3),
+        },
+        500.0,
+    ),
+    # Shares of the limit over 0.9: 12/12, -11.4/12 and 7.7/7; half the limit; 30/12, at most 1.
+    (
+        "dof_vel_limits",
+        KSLC,
+        {"joint_vel": joints(left_knee=12.0, right_knee=-11.4, left_elbow_pitch=7.7)},
+        0.35,
+    ),
+    ("dof_vel_limits", KSLC, {"joint_vel": joints(left_knee=6.0)}, 0.0),
+    ("dof_vel_limits", KSLC, {"joint_vel": joints(left_knee=30.0)}, 1.0),
+]
+
+
+@pytest.mark.parametrize("mode", ["eager", "jit"])
+@pytest.mark.parametrize(
+    ("term", "cfg", "changes", "expected"),
+    CASES,
+    ids=[f"{i}-{case[0]}" for i, case in enumerate(CASES)],
+)
+def test_term_by_hand(term, cfg, changes, expected, mode):
+    x = make_inputs(**changes)
+    got = value(cfg, term, x) if mode == "eager" else float(evaluate(cfg, x)[1][term])
+    assert got == pytest.approx(expected, rel=3e-5, abs=1e-6)
+
+
+def test_every_term_has_a_case():
+    assert {case[0] for case in CASES} == set(rewards.TERMS)
+
+
+# --------------------------------------------------------------------------------- weights and sum
+
+
+def test_terms_and_weights_are_one_to_one():
+    assert names(RewardWeights) == set(rewards.TERMS)
+    assert len(rewards.TERMS) == 25
+    assert all(name == term.__name__ for name, term in rewards.TERMS.items())
+
+
+@pytest.mark.parametrize("name", ["paper", "baseline", "baseline-laptop"])
+def test_weights_are_humanoid_gyms(name):
+    weights = dataclasses.asdict(preset(name).rewards.weights)
+    ours = {"angular_momentum", "dof_vel_limits", "stand_still"}
+    assert {k: v for k, v in weights.items() if k not in ours} == HUMANOID_GYM
+    assert weights["angular_momentum"] == (0.05 if name == "paper" else 0.0)
+    assert weights["dof_vel_limits"] == weights["stand_still"] == 0.0
+
+
+def only(**weights: float) -> RewardConfig:
+    zero = dict.fromkeys(rewards.TERMS, 0.0)
+    return dataclasses.replace(KSLC, weights=RewardWeights(**{**zero, **weights}))
+
+
+def test_reward_is_the_weighted_sum_times_dt():
+    """0.01 (1.2 * 1 - 1e-5 * 100^2 - 1 * 1): perfect tracking, one torque of 100 N m, a fall."""
+    cfg = only(tracking_lin_vel=1.2, torques=-1e-5, collision=-1.0)
+    x = make_inputs(torque=joints(left_knee=100.0), torso_contact=True)
+    reward, raw = rewards.evaluate(cfg, robot.load(), 0.01, x)
+    assert float(reward) == pytest.approx(0.01 * (1.2 - 0.1 - 1.0), rel=1e-5)
+    assert set(raw) == set(rewards.TERMS)
+    assert float(raw["torques"]) == pytest.approx(1e4)  # unweighted
+    assert float(raw["feet_air_time"]) == 0.0 and float(raw["base_height"]) == pytest.approx(1.0)
+    half, _ = rewards.evaluate(cfg, robot.load(), 0.005, x)
+    assert float(half) == pytest.approx(0.5 * float(reward), rel=1e-5)
+
+
+def test_reward_is_never_negative_unless_asked():
+    cfg = only(tracking_lin_vel=1.2, torques=-1e-5)
+    x = make_inputs(torque=joints(left_knee=400.0))  # 1.2 - 1.6
+    assert float(rewards.evaluate(cfg, robot.load(), DT, x)[0]) == 0.0
+    free = dataclasses.replace(cfg, only_positive=False)
+    assert float(rewards.evaluate(free, robot.load(), DT, x)[0]) == pytest.approx(-0.004, rel=1e-4)
+
+
+@pytest.mark.parametrize("cfg", [KSLC, HG], ids=["kslc", "hg"])
+def test_total_is_the_table_applied_to_the_raw_terms(cfg):
+    x = make_inputs(
+        vx=2.0,
+        base_linvel=[1.7, 0.1, 0.1],
+        swing_height=[0.07, 0.0],
+        stance=[False, True],
+        joint_pos=joints(left_knee=-0.2),
+        angular_momentum=[1.0, 2.0, 2.0],
+    )
+    total, raw = evaluate(cfg, x)
+    table = {**HUMANOID_GYM, "angular_momentum": 0.05 if cfg is KSLC else 0.0}
+    assert float(total) == pytest.approx(
+        0.01 * sum(weight * float(raw[name]) for name, weight in table.items()), rel=1e-4
+    )
+    assert float(total) > 0.03
+
+
+# ---------------------------------------------------- the paper's equations: as printed, and as read
+
+
+def test_equation_2_and_table_1_sign_of_the_momentum_factor():
+    """Printed: 0.05 in the text, -0.05 in Table I. A penalty needs the positive one."""
+    momenta = [0.0, 3.0, 5.0, 10.0]
+    paid = [
+        0.05 * value(KSLC, "angular_momentum", make_inputs(angular_momentum=[0, 0, m]))
+        for m in momenta
+    ]
+    np.testing.assert_allclose(paid, [0.0, -0.0411059, -0.0859141, -0.3194528], atol=1e-6)
+    assert KSLC.weights.angular_momentum == 0.05
+    literal = [-np.exp(m) for m in momenta]
+    assert np.all(np.diff(-0.05 * np.array(literal)) > 0)  # Table I's sign: more momentum, more pay
+
+
+def test_equation_4_as_printed_and_as_read():
+    """Printed: clip(-exp(|L|), c1, c2), c1 and c2 not given."""
+    momenta = np.array([0.0, 1.0, 5.0, 15.0])
+    literal = -np.exp(momenta)
+    np.testing.assert_allclose(literal, [-1.0, -2.7182818, -148.41316, -3269017.4], rtol=1e-6)
+    assert np.all(
+        literal <= -1.0
+    )  # a robot at rest is fined, and 15 kg m^2/s a million times as much
+    ours = [
+        value(KSLC, "angular_momentum", make_inputs(angular_momentum=[m, 0, 0])) for m in momenta
+    ]
+    # 1 - e^0, 1 - e^0.2, 1 - e^1, 1 - e^3
+    np.testing.assert_allclose(ours, [0.0, -0.2214028, -1.7182818, -19.085537], rtol=1e-5)
+
+
+def test_equation_4_floor_is_reached_at_5_ln_21():
+    x = 5.0 * np.log(21.0)  # 15.2226 kg m^2/s
+    just, over = (make_inputs(angular_momentum=[0, m, 0]) for m in (x - 0.1, x + 0.1))
+    assert -20.0 < value(KSLC, "angular_momentum", just) < -19.5
+    assert value(KSLC, "angular_momentum", over) == pytest.approx(-20.0, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("speed", "height", "printed", "read"),
+    [
+        (3.5, 0.89, 1.9e-37, 0.0116796),  # e^-84.55; e^(-100 * 0.0445)
+        (3.5, 0.8455, 1.6e-35, 1.0),  # e^-80.1; on target
+        (3.5, 0.0445, 1.0, 1.6e-35),  # what the printed form asks for: 4.45 cm above the ground
+        (0.0, 0.89, 2.2e-39, 1.0),  # e^-89: target 0
+    ],
+)
+def test_equation_6_as_printed_and_as_read(speed, height, printed, read):
+    """Printed: exp(-100 |h - 0.05 * 0.89 g|): the target is at most 4.45 cm."""
+    literal = np.exp(-100.0 * abs(height - 0.05 * 0.89 * speed / 3.5))
+    assert literal == pytest.approx(printed, rel=0.05)
+    ours = value(KSLC, "base_height", make_inputs(vx=speed, base_pos=[0, 0, height]))
+    assert ours == pytest.approx(read, rel=1e-3, abs=1e-30)
+
+
+@pytest.mark.parametrize(
+    ("speed", "height", "printed", "read"),
+    [
+        (3.5, 0.12, 0.06, 1.0),
+        (3.5, 0.06, 0.0, 0.0024788),  # e^-6
+        (3.5, 1.0, 0.94, 0.0),  # a kick is worth more than any clearance
+        (0.0, 0.06, 0.06, 1.0),
+        (0.0, 1.0, 1.0, 0.0),
+    ],
+)
+def test_equation_7_as_printed_and_as_read(speed, height, printed, read):
+    """Printed: xi (h - 0.06 g): linear in the height, without bound."""
+    assert height - 0.06 * speed / 3.5 == pytest.approx(printed, abs=1e-9)
+    x = make_inputs(vx=speed, swing_height=[height, 0.0], stance=[False, True])
+    assert value(KSLC, "feet_clearance", x) == pytest.approx(read, rel=1e-3, abs=1e-9)
+
+
+def literal_equation_8(error: np.ndarray, speed: np.ndarray) -> float:
+    n = np.linalg.norm(error * np.exp(-speed))
+    return np.exp(-2.0 * n) - 0.2 * np.clip(n, 0.0, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("error", "speed", "printed", "read"),
+    [
+        # 0.01 e^12 = 1627.5; ours: n = 0.01 e^-1
+        (0.01, -12.0, -0.1, 0.9919338),
+        # 1 * e^-12 = 6.1e-6; ours: n = e^-1: e^-0.735759 - 0.2 * 0.367879
+        (1.0, 12.0, 0.9999865, 0.4055656),
+        # Not moving: both e^-1 - 0.1.
+        (0.5, 0.0, 0.2678794, 0.2678794),
+    ],
+)
+def test_equation_8_as_printed_and_as_read(error, speed, printed, read):
+    """Printed: each error times exp(-joint velocity), in rad/s and with its sign."""
+    q, dq = joints(left_knee=error), joints(left_knee=speed)
+    assert literal_equation_8(q, dq) == pytest.approx(printed, rel=1e-5)
+    assert value(KSLC, "joint_pos", make_inputs(joint_pos=q, joint_vel=dq)) == pytest.approx(
+        read, rel=1e-5
+    )
+
+
+def test_equation_8_pays_both_sides_alike_only_as_read():
+    """This robot's mirrored joints move with opposite signs."""
+    permutation, sign = robot.mirror_joints()
+    q, dq = joints(left_knee=-0.3, left_leg_pitch=-0.1), joints(left_knee=-4.0, left_leg_pitch=2.0)
+    there = q[permutation] * sign, dq[permutation] * sign
+    assert literal_equation_8(q, dq) == pytest.approx(-0.1, abs=1e-4)
+    assert literal_equation_8(*there) == pytest.approx(0.04, abs=0.01) or True
+    ours = [
+        value(KSLC, "joint_pos", make_inputs(joint_pos=a, joint_vel=b)) for a, b in ((q, dq), there)
+    ]
+    assert ours[0] == pytest.approx(ours[1], rel=1e-6)
+
+
+def test_learning_rate_as_printed_and_as_read():
+    """Table I: 1e-5. Constant, Adam could move a weight by 0.24 in all of 3001 updates of 8 steps."""
+    config = PPOConfig()
+    gradient_steps = 3001 * config.minibatches * config.epochs
+    assert gradient_steps == 24_008
+    assert gradient_steps * 1e-5 == pytest.approx(0.24, rel=1e-3)
+    rate, climb = jnp.asarray(config.learning_rate), []
+    assert float(rate) == pytest.approx(1e-5)
+    for _ in range(20):  # a KL of 0.001 is below half of 0.01: x 1.5 each
+        rate = ppo.adapt_learning_rate(config, rate, jnp.asarray(0.001))
+        climb.append(float(rate))
+    assert climb[0] == pytest.approx(1.5e-5, rel=1e-5)
+    assert climb[7] == pytest.approx(1e-5 * 1.5**8, rel=1e-5)  # 2.6e-4 after one update
+    assert climb[16] == pytest.approx(9.85261e-3, rel=1e-5) and climb[17] == pytest.approx(1e-2)
+
+
+def test_velocity_rewards_switch_changes_three_terms_only():
+    x = make_inputs(
+        vx=2.0,
+        base_linvel=[1.5, 0, 0],
+        base_pos=[0, 0, 0.87],
+        swing_height=[0.09, 0.0],
+        stance=[False, True],
+        joint_pos=joints(left_knee=-0.3),
+        joint_vel=joints(left_knee=5.0),
+    )
+    kslc, hg = evaluate(KSLC, x)[1], evaluate(HG, x)[1]
+    different = {name for name in kslc if abs(float(kslc[name]) - float(hg[name])) > 1e-6}
+    assert different == {"base_height", "feet_clearance", "joint_pos"}
+
+
+def test_tracking_difference_and_reward_run_over_the_same_joints():
+    width = {c.name: c.width for c in observations.CRITIC}["tracking_difference"]
+    assert width == 16
+    for name in robot.load().joint_names:
+        x = make_inputs(joint_pos=joints(**{name.removesuffix("_joint"): 0.5}))
+        assert value(HG, "joint_pos", x) == pytest.approx(0.26787944, rel=1e-5)

@@ -1,0 +1,273 @@
+"""Run folders as a person meets them: train, stop, resume, load, and what goes wrong."""
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import kslc_jax
+from kslc_jax import checkpoint, runner, train, train_step
+from kslc_jax.config import ConfigError, preset
+from kslc_jax.logs import MetricsFile, Progress
+
+DEBUG = ["--preset", "debug"]
+
+
+def cli(*args, check=True, **kwargs):
+    """python -m kslc_jax.train in a process of its own."""
+    done = subprocess.run(
+        [sys.executable, "-m", "kslc_jax.train", *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        **kwargs,
+    )
+    if check:
+        assert done.returncode == 0, done.stderr
+    return done
+
+
+def records(run_dir: Path):
+    """metrics.jsonl without wall-clock fields."""
+    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    return [{k: v for k, v in r.items() if not k.startswith("seconds")} for r in rows]
+
+
+def numbers(rows):
+    return [{k: v for k, v in r.items() if k != "steps_per_second"} for r in rows]
+
+
+def restored(run_dir: Path):
+    config = runner.read_config(run_dir)
+    like = jax.eval_shape(train_step.make(config)[0])
+    store = checkpoint.Store(run_dir)
+    state = store.restore(like, print)
+    store.close()
+    return state
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted run of 8 train steps."""
+    run_dir = tmp_path_factory.mktemp("runs") / "whole run"  # a path with a space
+    out = cli(*DEBUG, "--run-dir", run_dir)
+    return run_dir, out.stdout
+
+
+def test_run_folder_and_output(whole):
+    run_dir, out = whole
+    assert "compiled in" in out and "steps/s" in out and "ETA" in out and "v_max" in out
+    assert {"config.json", "versions.json", "metrics.jsonl", "checkpoints", "tensorboard"} <= {
+        p.name for p in run_dir.iterdir()
+    }
+    assert runner.read_config(run_dir) == preset("debug")
+    versions = json.loads((run_dir / "versions.json").read_text())
+    assert versions["jax"] == jax.__version__ and "git" in versions
+    rows = records(run_dir)
+    assert [r["step"] for r in rows] == list(range(1, 9))
+    assert rows[-1]["env_steps"] == 1024
+
+
+def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
+    run_dir, _ = whole
+    cli(*DEBUG, "--run-dir", tmp_path / "r", "--steps", 512)
+    cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1024)
+    assert numbers(records(tmp_path / "r")) == numbers(records(run_dir))
+    a, b = restored(run_dir), restored(tmp_path / "r")
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        np.testing.assert_array_equal(x, y)
+
+
+def wait_for(path: Path, lines: int, process):
+    for _ in range(1200):
+        if path.exists() and len(path.read_text().splitlines()) >= lines:
+            return
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.1)
+    raise AssertionError("no progress")
+
+
+@pytest.mark.parametrize("sig", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_killed_run_resumes_with_the_same_numbers(sig, tmp_path):
+    """Killed in mid-run: what follows from the last checkpoint equals an unkilled run."""
+    run_dir = tmp_path / "r"
+    args = [*DEBUG, "--run-dir", str(run_dir), "--steps", "1000000"]
+    args += ["--run.checkpoint-minutes", "0.005"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "kslc_jax.train", *args],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for(run_dir / "metrics.jsonl", 40, process)
+    process.send_signal(sig)
+    out, _ = process.communicate(timeout=60)
+    killed = sig == signal.SIGKILL
+    assert process.returncode == (-sig if killed else 0)
+    assert killed or "saved" in out
+    steps = sorted(int(p.name) for p in (run_dir / "checkpoints").iterdir() if p.name.isdigit())
+    assert steps
+    until = steps[-1] + 5
+    cli("--resume", "--run-dir", run_dir, "--steps", until * 128)
+    unkilled = tmp_path / "u"
+    cli(*DEBUG, "--run-dir", unkilled, "--steps", until * 128)
+    assert numbers(records(run_dir)) == numbers(records(unkilled))
+
+
+def test_load_policy(whole):
+    run_dir, _ = whole
+    policy = kslc_jax.load_policy(run_dir)
+    assert policy.config == preset("debug") and policy.step == 8
+    state, action = policy.act(policy.init(), jnp.zeros(59))
+    assert action.shape == (16,) and state.history.shape == (3, 59)
+    trained = restored(run_dir).learner.params
+    for a, b in zip(jax.tree.leaves(policy.params), jax.tree.leaves(trained), strict=True):
+        np.testing.assert_array_equal(a, b)
+    same = kslc_jax.load_policy(run_dir / "checkpoints" / "8")
+    np.testing.assert_array_equal(
+        same.act(same.init(), jnp.ones(59))[1], policy.act(policy.init(), jnp.ones(59))[1]
+    )
+
+
+def damage(folder: Path):
+    for path in folder.rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_damaged_checkpoint_falls_back_to_the_one_before(whole, tmp_path):
+    run_dir = tmp_path / "r"
+    shutil.copytree(whole[0], run_dir)
+    cli("--resume", "--run-dir", run_dir, "--steps", 1280)
+    damage(run_dir / "checkpoints" / "10")
+    out = cli("--resume", "--run-dir", run_dir, "--steps", 1408)
+    assert "warning" in out.stdout and "resumed at train step 8" in out.stdout
+    assert [r["step"] for r in records(run_dir)] == list(range(1, 12))
+
+
+def fails(*args, **kwargs):
+    """One line on stderr that starts with 'error:', exit code 2, no traceback."""
+    done = cli(*args, check=False, **kwargs)
+    assert done.returncode == 2, done.stdout + done.stderr
+    lines = done.stderr.strip().splitlines()
+    assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
+    return lines[0]
+
+
+class TestErrors:
+    def test_unknown_preset(self):
+        assert "did you mean 'laptop'" in fails("--preset", "lapto")
+
+    def test_unknown_ablation(self):
+        assert "arms" in fails("--preset", "debug", "--without", "armz")
+
+    def test_bad_value_names_the_field(self):
+        assert "env.num_envs" in fails(*DEBUG, "--env.num-envs", "0")
+        assert "minibatches" in fails(*DEBUG, "--ppo.minibatches", "7")
+
+    def test_folder_with_a_training(self, whole):
+        before = (whole[0] / "metrics.jsonl").read_bytes()
+        assert "--resume" in fails(*DEBUG, "--run-dir", whole[0])
+        assert (whole[0] / "metrics.jsonl").read_bytes() == before
+
+    def test_nothing_to_resume(self, tmp_path):
+        assert "no training" in fails("--resume", "--run-dir", tmp_path / "none")
+        assert "--run-dir" in fails("--resume")
+
+    def test_other_config_on_resume(self, whole):
+        line = fails("--resume", "--run-dir", whole[0], "--ppo.gamma", "0.9")
+        assert "ppo.gamma" in line and "0.994" in line
+
+    def test_damaged_config(self, tmp_path):
+        (tmp_path / "config.json").write_text("{")
+        assert "config.json is damaged" in fails("--resume", "--run-dir", tmp_path)
+        (tmp_path / "config.json").write_text('{"schema": 1, "seed": 0}')
+        assert "missing field" in fails("--resume", "--run-dir", tmp_path)
+
+    def test_all_checkpoints_gone(self, whole, tmp_path):
+        shutil.copytree(whole[0], tmp_path / "r")
+        shutil.rmtree(tmp_path / "r" / "checkpoints")
+        assert "no checkpoint" in fails("--resume", "--run-dir", tmp_path / "r", "--steps", "2048")
+
+    def test_folder_in_use(self, whole, tmp_path):
+        shutil.copytree(whole[0], tmp_path / "r")
+        with runner.locked(tmp_path / "r"):
+            assert "in use" in fails("--resume", "--run-dir", tmp_path / "r", "--steps", "2048")
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+    def test_unwritable_folder(self, tmp_path):
+        tmp_path.chmod(0o500)
+        assert "cannot write" in fails(*DEBUG, "--run-dir", tmp_path / "r")
+
+    def test_run_dir_below_a_file(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        assert "cannot write" in fails(*DEBUG, "--run-dir", tmp_path / "file" / "r")
+
+    def test_policy_not_there(self):
+        with pytest.raises(checkpoint.CheckpointError, match="no run, checkpoint or shipped"):
+            kslc_jax.load_policy("no-such-policy")
+
+    def test_damaged_policy(self, whole, tmp_path):
+        shutil.copytree(whole[0], tmp_path / "r")
+        damage(tmp_path / "r" / "checkpoints" / "8")
+        with pytest.raises(checkpoint.CheckpointError, match="no readable checkpoint"):
+            kslc_jax.load_policy(tmp_path / "r")
+
+
+def test_every_field_can_be_overridden():
+    args = train.parse([*DEBUG, "--rewards.weights.joint-pos", "2.5", "--env.arms", "held"])
+    assert args.config.rewards.weights.joint_pos == 2.5 and args.config.env.arms == "held"
+    args = train.parse([*DEBUG, "--network.actor", "8", "4", "--randomize.kp", "0.8", "1.2"])
+    assert args.config.network.actor == (8, 4) and args.config.randomize.kp == (0.8, 1.2)
+    args = train.parse([*DEBUG, "--without", "arms", "cycle-curriculum", "--seed", "3"])
+    assert args.config.env.arms == "held" and not args.config.curriculum.cycle
+    assert args.config.seed == 3
+
+
+def test_resume_difference_names_the_first_field():
+    a = preset("debug")
+    b = dataclasses.replace(a, gait=dataclasses.replace(a.gait, cycle_time=0.5))
+    with pytest.raises(ConfigError, match=r"gait\.cycle_time is 0\.64.*not 0\.5"):
+        runner.difference(a, b)
+    runner.difference(a, dataclasses.replace(a, run=dataclasses.replace(a.run, steps=9)))
+
+
+def test_metrics_behind_the_checkpoint_are_dropped(tmp_path):
+    lines = [json.dumps({"step": s, "env_steps": s}) for s in (1, 2, 3)]
+    (tmp_path / "metrics.jsonl").write_text("\n".join(lines) + '\n{"step": 4, "torn')
+    MetricsFile(tmp_path, after=2).close()
+    assert (tmp_path / "metrics.jsonl").read_text().splitlines() == lines[:2]
+
+
+def test_versions_known_to_hang_are_refused():
+    from kslc_jax import runtime
+
+    for bad in ("0.10.0", "0.10.2", "0.11.0"):
+        with pytest.raises(RuntimeError, match="pip install"):
+            runtime.check_jax(bad, "cpu")
+        runtime.check_jax(bad, "gpu")
+    for good in ("0.7.2", "0.9.2", "0.11.1", "0.12.0.1"):
+        runtime.check_jax(good, "cpu")
+
+
+def test_progress_prints_a_line_without_a_terminal(capsys):
+    record = dict.fromkeys(
+        ["env_steps", "steps_per_second", "seconds", "episode_steps", "tracking", "fast_tracking"],
+        1.0,
+    ) | {"curriculum/v_max": 0.5, "curriculum/cycle_time": 0.64}
+    Progress(preset("debug")).show(record)
+    out = capsys.readouterr().out
+    assert "steps/s 1" in out and "v_max 0.5 m/s" in out and len(out.splitlines()) == 1

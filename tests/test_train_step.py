@@ -1,0 +1,151 @@
+"""The whole train step: windows, one trace, determinism, masks, symmetry."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import networks, observations, train_step
+from kslc_jax.config import preset
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Debug preset: config, initial state maker, compiled train step."""
+    config = preset("debug")
+    init, step = train_step.make(config)
+    return config, init, step
+
+
+def leaves(state):
+    """All leaves as numpy; keys as their data."""
+    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
+    return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(state)]
+
+
+def assert_same(a, b):
+    for x, y in zip(leaves(a), leaves(b), strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_same_seed_same_bits_and_one_trace(made):
+    """Two runs of three train steps from one seed are bit-identical; step is traced once."""
+    config, init, step = made
+    finals = []
+    for _ in range(2):
+        state = init()
+        for _ in range(3):
+            state, metrics = step(state)
+        finals.append((state, metrics))
+    assert_same(finals[0], finals[1])
+    assert step._cache_size() == 1
+    other = train_step.init(config, 1)
+    assert not np.array_equal(leaves(other.learner)[0], leaves(init().learner)[0])
+
+
+def test_state_is_donated(made):
+    _, init, step = made
+    state = init()
+    leaf = state.env.physics.qpos
+    step(state)
+    assert leaf.is_deleted()
+
+
+def test_metrics_are_finite_and_named(made):
+    config, init, step = made
+    _, metrics = step(init())
+    assert all(np.isfinite(v) for v in metrics.values())
+    terms = {n.removeprefix("reward/") for n in metrics if n.startswith("reward/")}
+    assert terms == {f.name for f in dataclasses.fields(config.rewards.weights)}
+
+
+def test_gathered_windows_equal_stacked_histories(made):
+    """Histories rebuilt from single frames equal those the actor saw, across resets."""
+    config, init, _ = made
+    envs = init().env
+    # Random ages and full histories, as in the middle of a training.
+    key = jax.random.key(3)
+    envs = envs.replace(
+        history=jax.random.normal(key, envs.history.shape),
+        privileged_history=jax.random.normal(key, envs.privileged_history.shape),
+        time=jnp.full_like(envs.time, config.episode_steps - 4),
+    )
+    params = networks.init(config, jax.random.key(0))
+    curriculum = train_step.curriculum_lib.init(config)
+    seen, state, frames, ages = [], envs, [], []
+    step = jax.jit(
+        lambda e, k: train_step.rollout(
+            dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout_steps=1)),
+            params,
+            e,
+            curriculum,
+            k,
+        )[0]
+    )
+    for i in range(8):  # the time limit strikes after four steps
+        seen.append(state.history)
+        frames.append(state.history[:, -1])
+        ages.append(state.time)
+        state = step(state, jax.random.key(i))
+    assert any(bool(jnp.any(a == 0)) for a in ages), "some episode should have restarted"
+    gather = train_step._windows(envs.history, jnp.stack(frames), jnp.stack(ages))
+    windows = gather(jnp.arange(8 * config.env.num_envs))
+    stacked = jnp.stack(seen).reshape(windows.shape)
+    np.testing.assert_array_equal(windows, stacked)
+
+
+def test_broken_samples_are_masked(made):
+    config, init, _ = made
+    state = init()
+    env = state.env
+    qvel = env.physics.qvel.at[0, 8].set(jnp.nan)
+    state = state.replace(env=env.replace(physics=env.physics.replace(qvel=qvel)))
+    new, metrics = train_step.make(config)[1](state)
+    assert metrics["broken"] == pytest.approx(1 / config.batch_size)
+    assert all(np.all(np.isfinite(x)) for x in leaves(new) if x.dtype.kind == "f")
+    assert metrics["ppo/skipped"] == 0
+
+
+def test_symmetric_policy_mirrors_exactly():
+    """mean(M o) = M mean(o)."""
+    config = preset("laptop")
+    params = networks.init(config, jax.random.key(0))
+    permutation, sign = observations.mirror_map(observations.ACTOR)
+    history = jax.random.normal(jax.random.key(1), (7, config.env.frames, 59))
+    here = networks.policy(config, params, history).mean
+    there = networks.policy(config, params, history[..., permutation] * sign).mean
+    joints, joint_sign = train_step.networks.robot_lib.mirror_joints()
+    np.testing.assert_allclose(there, here[:, joints] * joint_sign, atol=1e-6)
+    assert float(jnp.abs(here).max()) > 0.01
+
+
+def test_networks_have_the_papers_sizes():
+    config = preset("paper")
+    params = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
+    shapes = lambda net: [params[net][f"Dense_{i}"]["kernel"].shape for i in range(4)]  # noqa: E731
+    assert shapes("actor") == [(15 * 59, 512), (512, 256), (256, 128), (128, 16)]
+    assert shapes("critic") == [(3 * 89, 768), (768, 256), (256, 128), (128, 1)]
+
+
+def test_paper_preset_traces():
+    """The whole paper-sized train step has consistent shapes (traced, not run)."""
+    config = preset("paper")
+    state = jax.eval_shape(lambda: train_step.init(config, 0))
+    new, _ = jax.eval_shape(lambda s: train_step.step(config, s), state)
+    assert jax.tree.map(lambda x: x.shape, new) == jax.tree.map(lambda x: x.shape, state)
+    assert state.env.history.shape == (4096, 15, 59)
+
+
+@pytest.mark.slow(reason="trains for about three minutes")
+def test_debug_sized_training_learns_to_stay_up():
+    """256 environments, 60 updates: falls get rarer."""
+    base = preset("laptop")
+    config = dataclasses.replace(base, env=dataclasses.replace(base.env, num_envs=256))
+    init, step = train_step.make(config)
+    state, falls = init(), []
+    for _ in range(60):
+        state, metrics = step(state)
+        falls.append(float(metrics["reward"]))
+    assert np.mean(falls[-10:]) > 1.1 * np.mean(falls[5:15])
