@@ -20,8 +20,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from kslc_jax import config as config_lib
+from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import networks, observations
 from kslc_jax.config import Config
+from kslc_jax.curriculum import Curriculum
 from kslc_jax.train_step import TrainState
 
 FOLDER = "checkpoints"
@@ -154,6 +156,7 @@ class Policy:
 
     config: Config
     params: networks.Params
+    curriculum: Curriculum  # where the training had got to: v_max and gait cycle
     step: int
 
     def init(self) -> PolicyState:
@@ -163,8 +166,11 @@ class Policy:
     def act(self, state: PolicyState, frame: jax.Array) -> tuple[PolicyState, jax.Array]:
         """Deterministic action [16] for the newest actor frame [59]."""
         history = observations.push_history(state.history, frame)
-        mean = networks.policy(self.config, self.params, history).mean
-        return PolicyState(history), mean
+        return PolicyState(history), self.act_on(history)
+
+    def act_on(self, history: jax.Array) -> jax.Array:
+        """Deterministic action [16] for a whole history [K, 59]."""
+        return networks.policy(self.config, self.params, history).mean
 
 
 def load_policy(path_or_name: str | Path) -> Policy:
@@ -178,6 +184,11 @@ def load_policy(path_or_name: str | Path) -> Policy:
         try:
             meta = reader.restore(folder, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
             config = config_lib.from_dict(meta["meta"]["config"])
+            reached = meta["meta"]["metrics"]
+            curriculum = curriculum_lib.init(config).replace(
+                v_max=jnp.asarray(reached["curriculum/v_max"]),
+                cycle_time=jnp.asarray(reached["curriculum/cycle_time"]),
+            )
             like = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
             args = ocp.args.Composite(params=ocp.args.StandardRestore(_abstract(like)))
             params = reader.restore(folder, args=args)["params"]
@@ -187,7 +198,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves(params))
     if not finite:
         raise CheckpointError(f"{folder}: the parameters hold NaN or infinity")
-    return Policy(config, params, int(folder.name) if folder.name.isdigit() else 0)
+    return Policy(config, params, curriculum, int(folder.name) if folder.name.isdigit() else 0)
 
 
 def _checkpoint_folder(path: Path) -> Path:

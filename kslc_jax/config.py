@@ -16,7 +16,7 @@ import difflib
 import json
 import typing
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 SCHEMA_VERSION = 1
 NUM_JOINTS = 16
@@ -40,6 +40,8 @@ def _check_range(name: str, value: Range) -> None:
 @dataclass(frozen=True)
 class PhysicsConfig:
     """Simulation of one control step."""
+
+    fidelity: ClassVar[Literal["train", "high"]] = "train"
 
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: pure XLA, any device. mujoco: C MuJoCo on all CPU cores behind one callback, over twice
@@ -66,6 +68,23 @@ class PhysicsConfig:
     def control_dt(self) -> float:
         """Seconds per control step."""
         return self.timestep * self.decimation
+
+
+@dataclass(frozen=True)
+class HighFidelity(PhysicsConfig):
+    """Evaluation in full C MuJoCo: 1 ms, converged solver, and what robot.load("high") adds."""
+
+    fidelity: ClassVar[Literal["train", "high"]] = "high"
+
+    engine: Literal["auto", "mjx", "mujoco"] = "mujoco"
+    timestep: float = 0.001
+    decimation: int = 10
+    iterations: int = 100
+    ls_iterations: int = 50
+
+    def __post_init__(self):
+        super().__post_init__()
+        _check(self.engine == "mujoco", "high fidelity needs physics.engine mujoco")
 
 
 @dataclass(frozen=True)
@@ -560,7 +579,8 @@ def from_dict(data: dict[str, Any]) -> Config:
 
 def _build(cls: type, data: Any, where: str) -> Any:
     _check(isinstance(data, dict), f"{where}: expected an object, got {type(data).__name__}")
-    hints = typing.get_type_hints(cls)
+    resolved = typing.get_type_hints(cls)
+    hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
     unknown = set(data) - set(hints)
     _check(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
     missing = set(hints) - set(data)

@@ -75,7 +75,7 @@ def init(config: Config, key: jax.Array) -> Params:
     return {
         "actor": _actor(config).init(key_actor, history)["params"],
         "critic": _critic(config).init(key_critic, privileged)["params"],
-        "log_std": jnp.full(NUM_JOINTS, jnp.log(config.network.init_std)),
+        "log_std": jnp.full(NUM_JOINTS, jnp.log(config.network.init_std), jnp.float32),
     }
 
 

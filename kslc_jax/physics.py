@@ -52,9 +52,9 @@ class PhysicsState:
 
 
 def robot_for(config: PhysicsConfig) -> Robot:
-    """The training-fidelity robot at the config's timestep and solver settings (cached)."""
+    """The robot at the config's fidelity, timestep and solver settings (cached)."""
     return robot_lib.load(
-        "train",
+        config.fidelity,
         timestep=config.timestep,
         iterations=config.iterations,
         ls_iterations=config.ls_iterations,

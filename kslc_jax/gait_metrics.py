@@ -1,0 +1,145 @@
+"""Numbers that describe how a robot moves, from a `Trace`; numpy only.
+
+All take the trace of one commanded speed, [T, N, ...], and count only trials that did not fall,
+after a second to settle; `summary` puts them together.
+"""
+
+import numpy as np
+
+from kslc_jax.robot import Robot
+from kslc_jax.trials import Trace
+
+GRAVITY = 9.81
+SETTLE = 2.0
+"""Seconds at the start that do not count."""
+
+
+def _steady(trace: Trace, dt: float) -> Trace:
+    """The trace after settling, of the trials that did not fall."""
+    start = round(SETTLE / dt)
+    upright = trace.alive[-1]
+    fields = {n: getattr(trace, n)[start:, upright] for n in trace.__dataclass_fields__}
+    return Trace(**fields)
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean over trials of the correlation in time of [T, N] signals; 0 where nothing moves."""
+    a, b = a - a.mean(0), b - b.mean(0)
+    scale = np.sqrt((a**2).sum(0) * (b**2).sum(0))
+    return float(np.mean(np.where(scale > 1e-6, (a * b).sum(0) / np.maximum(scale, 1e-6), 0.0)))
+
+
+def _difference(left: float, right: float) -> float:
+    """|left - right| as a share of their mean."""
+    return abs(left - right) / max(0.5 * (abs(left) + abs(right)), 1e-6)
+
+
+def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
+    """Tracking as the paper measures it: mean forward velocity, 0 for a trial that fell."""
+    start = round(SETTLE / dt)
+    upright = trace.alive[-1]
+    mean = np.where(upright, trace.linvel[start:, :, 0].mean(0), 0.0)
+    out = {
+        "survival": float(upright.mean()),
+        "forward_mean": float(mean.mean()),
+        "forward_rmse": float(np.sqrt(np.mean((mean - command) ** 2))),
+    }
+    s = _steady(trace, dt)
+    if upright.any():
+        out |= {
+            "forward_std": float(s.linvel[..., 0].std(0).mean()),
+            "lateral_std": float(s.linvel[..., 1].std(0).mean()),
+            "yaw_rate_std": float(s.angvel[..., 2].std(0).mean()),
+            "roll_deg": float(np.degrees(np.abs(s.euler[..., 0]).mean())),
+            "pitch_deg": float(np.degrees(s.euler[..., 1].mean())),
+        }
+    return out
+
+
+def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
+    """Use of the motors, and cost of transport."""
+    s = _steady(trace, dt)
+    power = np.abs(s.torque * s.joint_vel).sum(-1).mean()
+    distance = max(abs(float(s.linvel[..., 0].mean())), 1e-3)
+    load = np.abs(s.torque) / robot.effort_limit
+    return {
+        "cost_of_transport": float(power / (robot.total_mass * GRAVITY * distance)),
+        "within_speed_limits": float((np.abs(s.joint_vel) <= robot.speed_limit).all(-1).mean()),
+        "peak_torque_share": float(load.max()),
+        "mean_torque_share": float(load.mean()),
+    }
+
+
+def strides(trace: Trace, dt: float) -> dict[str, float]:
+    """Stride frequency and length, flight, clearance, and how alike left and right are."""
+    s = _steady(trace, dt)
+    touchdowns = (s.contact[1:] & ~s.contact[:-1]).sum(0)  # [N, 2]
+    seconds = len(s.contact) * dt
+    frequency = float(touchdowns.mean() / seconds)
+    swing_top = [
+        float(np.percentile(s.foot_height[..., i], 95) - np.percentile(s.foot_height[..., i], 5))
+        for i in (0, 1)
+    ]
+    stance = s.contact.mean((0, 1))
+    return {
+        "stride_frequency": frequency,
+        "stride_length": float(s.linvel[..., 0].mean() / max(frequency, 1e-3)),
+        "flight_share": float((~s.contact.any(-1)).mean()),
+        "double_support_share": float(s.contact.all(-1).mean()),
+        "clearance": min(swing_top),
+        "stance_difference": _difference(*map(float, stance)),
+        "clearance_difference": _difference(*swing_top),
+    }
+
+
+def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
+    """Joint ranges of the two sides, and arms against legs."""
+    s = _steady(trace, dt)
+    q = s.qpos[..., 7:]
+    names = list(robot.joint_names)
+    low, high = np.percentile(q, [5, 95], axis=0).mean(1)
+    span = dict(zip(names, high - low, strict=True))
+    out = {
+        f"{joint}_range_difference": _difference(
+            span[f"left_{joint}_joint"], span[f"right_{joint}_joint"]
+        )
+        for joint in ("leg_pitch", "knee", "shoulder_pitch")
+    }
+    out["shoulder_range"] = float(span["left_shoulder_pitch_joint"])
+    # Both axes point the same way on a side: equal signs swing arm and leg to the same side.
+    out["shoulder_hip_correlation"] = float(
+        np.mean(
+            [
+                _correlation(
+                    q[..., names.index(f"{side}_shoulder_pitch_joint")],
+                    q[..., names.index(f"{side}_leg_pitch_joint")],
+                )
+                for side in ("left", "right")
+            ]
+        )
+    )
+    return out
+
+
+def momentum(trace: Trace, dt: float) -> dict[str, float]:
+    """Root mean square of the whole-body angular momentum [kg m^2/s]."""
+    s = _steady(trace, dt)
+    squares = (s.angular_momentum**2).mean((0, 1))
+    return {
+        "momentum_rms": float(np.sqrt(squares.sum())),
+        "momentum_yaw_rms": float(np.sqrt(squares[2])),
+    }
+
+
+def summary(trace: Trace, command: float, robot: Robot, dt: float) -> dict[str, float]:
+    """Everything; only survival and speed where every trial fell."""
+    out = speed(trace, command, dt)
+    if out["survival"] == 0.0:
+        return out
+    return (
+        out
+        | effort(trace, robot, dt)
+        | strides(trace, dt)
+        | symmetry(trace, robot, dt)
+        | momentum(trace, dt)
+    )

@@ -1,0 +1,131 @@
+"""Trials: a trained policy under fixed commands, in the environment it was trained in or in full
+C MuJoCo at high fidelity. One code path for both: only the physics config differs.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kslc_jax import commands, env, physics, signals
+from kslc_jax.checkpoint import Policy
+from kslc_jax.config import Config, PhysicsConfig, RandomizeConfig
+
+NOMINAL = RandomizeConfig(
+    friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0
+)
+"""No randomisation: friction 1, the robot as described, no pushes."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """Under what conditions a policy is tried."""
+
+    physics: PhysicsConfig
+    randomize: RandomizeConfig = NOMINAL
+    seconds: float = 20.0
+    noise: bool = False
+    """Sensor noise, action delay and action noise as in training."""
+
+
+@flax.struct.dataclass
+class Trace:
+    """What was recorded, [T, N, ...]; nothing counts from a fall on, where `alive` is False."""
+
+    alive: jax.Array  # bool
+    qpos: jax.Array  # [23]
+    linvel: jax.Array  # [3] m/s, base frame
+    angvel: jax.Array  # [3] rad/s, base frame
+    euler: jax.Array  # [3] rad
+    joint_vel: jax.Array  # [16] rad/s
+    torque: jax.Array  # [16] N m
+    contact: jax.Array  # [2] bool, left and right foot
+    foot_height: jax.Array  # [2] m, ankle-roll link
+    angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
+
+
+def trial_config(config: Config, setting: Setting, count: int) -> Config:
+    """The policy's config under the setting's conditions: fixed commands, no time limit."""
+    quiet = {} if setting.noise else {"noise_level": 0.0, "action_delay": 0.0, "action_noise": 0.0}
+    seconds = 10.0 * setting.seconds
+    return dataclasses.replace(
+        config,
+        physics=setting.physics,
+        randomize=setting.randomize,
+        env=dataclasses.replace(config.env, num_envs=count, episode_seconds=seconds, **quiet),
+        command=dataclasses.replace(config.command, resample_seconds=seconds),
+        ppo=dataclasses.replace(config.ppo, minibatches=1),
+    )
+
+
+def run(
+    policy: Policy, setting: Setting, velocities: np.ndarray, seed: int = 0, chunk: float = 1.0
+) -> Iterator[Trace]:
+    """Tries one command per environment; yields the trace in pieces of `chunk` seconds.
+
+    Args:
+      policy: acts deterministically.
+      setting: conditions.
+      velocities: [N, 3] commanded vx, vy [m/s] and, by heading, yaw rate [rad/s]. With a yaw rate
+        of 0 the robot is asked to keep its heading, as in training.
+      seed: of initial states and randomisation.
+      chunk: seconds per piece.
+    """
+    config = trial_config(policy.config, setting, len(velocities))
+    robot = physics.robot_for(config.physics)
+    key_reset, key_run = jax.random.split(jax.random.key(seed))
+    keys = jax.random.split(key_reset, len(velocities))
+    wanted = jnp.asarray(velocities, jnp.float32)
+
+    def hold(state: env.EnvState, velocity: jax.Array) -> env.EnvState:
+        """The wanted command; a wanted yaw rate moves the heading ahead of the robot."""
+        yaw = signals.read(robot, state.physics).base_euler[2]
+        ahead = yaw + velocity[2] / config.command.heading_gain
+        heading = jnp.where(velocity[2] == 0.0, 0.0, ahead)
+        command = commands.with_velocity(config.command, state.command, velocity)
+        return state.replace(command=command.replace(heading=heading))
+
+    def one(carry, key):
+        state, alive = carry
+        state = jax.vmap(hold)(state, wanted)
+        action = jax.vmap(policy.act_on)(state.history)
+        step_keys = jax.random.split(key, len(velocities))
+        state, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(
+            config, state, action, step_keys, policy.curriculum
+        )
+        alive = alive & ~outcome.terminated
+        return (state, alive), _record(robot, state, alive)
+
+    reset = jax.jit(jax.vmap(lambda k: env.reset(config, k, policy.curriculum)))
+    advance = jax.jit(lambda carry, keys: jax.lax.scan(one, carry, keys))
+    carry = reset(keys), jnp.ones(len(velocities), bool)
+    steps = round(chunk / config.control_dt)
+    for i in range(round(setting.seconds / chunk)):
+        step_keys = jax.random.split(jax.random.fold_in(key_run, i), steps)
+        carry, trace = advance(carry, step_keys)
+        yield jax.tree.map(np.asarray, trace)
+
+
+def _record(robot, state: env.EnvState, alive: jax.Array) -> Trace:
+    now = jax.vmap(lambda s: signals.read(robot, s))(state.physics)
+    return Trace(
+        alive=alive,
+        qpos=state.physics.qpos,
+        linvel=now.base_linvel,
+        angvel=now.base_angvel,
+        euler=now.base_euler,
+        joint_vel=now.joint_vel,
+        torque=now.torque,
+        contact=now.foot_contact,
+        foot_height=now.foot_pos[..., 2],
+        angular_momentum=now.angular_momentum,
+    )
+
+
+def join(pieces: list[Trace]) -> Trace:
+    """One trace from consecutive pieces."""
+    return jax.tree.map(lambda *x: np.concatenate(x), *pieces)

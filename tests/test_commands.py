@@ -1,0 +1,186 @@
+"""Commands: dead zone, heading, narrowing and standing still, with ranges of one value."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from states import make_command
+
+from kslc_jax import commands
+from kslc_jax.config import CommandConfig, preset
+
+PAPER = preset("paper").command
+KEY = jax.random.key(0)
+
+
+def draw(vx=0.0, vy=0.0, heading=0.0, yaw=0.0, **changes):
+    """The command drawn from ranges that hold one value."""
+    config = dataclasses.replace(PAPER, vy=(vy, vy), heading=(heading, heading), **changes)
+    return commands.sample(config, KEY, (jnp.asarray(vx), jnp.asarray(vx)), jnp.asarray(yaw))
+
+
+def draw_many(config: CommandConfig, n=4000, vx=(-0.3, 3.5), yaw=0.0):
+    bounds = jnp.asarray(vx[0]), jnp.asarray(vx[1])
+    sample = jax.vmap(lambda key: commands.sample(config, key, bounds, jnp.asarray(yaw)))
+    return sample(jax.random.split(KEY, n))
+
+
+@pytest.mark.parametrize(
+    ("vx", "vy", "expected"),
+    [
+        (1.0, -0.3, [1.0, -0.3]),
+        (0.1, 0.1, [0.0, 0.0]),  # norm 0.141
+        (0.2, 0.0, [0.0, 0.0]),  # exactly on the edge
+        (0.0, -0.21, [0.0, -0.21]),
+        (-0.15, 0.15, [-0.15, 0.15]),  # norm 0.212, though both are small
+    ],
+)
+def test_dead_zone(vx, vy, expected):
+    np.testing.assert_allclose(draw(vx, vy).velocity[:2], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("heading", "yaw", "rate"),
+    [
+        (1.0, 0.2, 0.4),  # 0.5 * 0.8
+        (0.2, 1.0, -0.4),
+        (3.0, 0.0, 1.0),  # 1.5, clipped
+        (-3.0, 0.0, -1.0),
+        (3.0, -3.0, -0.1415927),  # the short way round: 6 - 2 pi = -0.2831853
+        (-3.0, 3.0, 0.1415927),
+    ],
+)
+def test_heading_error_becomes_a_yaw_rate(heading, yaw, rate):
+    command = draw(1.0, 0.0, heading, yaw)
+    np.testing.assert_allclose(command.velocity, [1.0, 0.0, rate], atol=1e-6)
+    assert float(command.heading) == pytest.approx(heading)
+    # The same once more from the next yaw: nothing accumulates.
+    turned = jax.jit(lambda c, y: commands.steer(PAPER, c, y))(command, jnp.asarray(heading))
+    np.testing.assert_allclose(turned.velocity, [1.0, 0.0, 0.0], atol=1e-6)
+
+
+def test_gain_and_limit_of_the_yaw_rate_are_the_configs():
+    config = dataclasses.replace(PAPER, heading_gain=2.0, max_yaw_rate=0.7)
+    command = make_command(velocity=[1.0, 0.0, 0.0], heading=0.3)
+    for yaw, rate in ((0.0, 0.6), (-0.1, 0.7), (0.4, -0.2)):
+        got = commands.steer(config, command, jnp.asarray(yaw)).velocity[2]
+        assert float(got) == pytest.approx(rate, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("vx", "vy", "heading"),
+    [
+        (0.0, 0.3, 2.0),  # all of it
+        (2.0, 0.15, 1.5),  # half: 1 + (2 - 1) / 2
+        (-1.0, 0.225, 1.75),  # three quarters
+        (4.0, 0.0, 1.0),  # nothing
+        (6.0, 0.0, 1.0),
+    ],
+)
+def test_fast_commands_are_narrow(vx, vy, heading):
+    """With narrow_speed 4 and yaw 1, of vy 0.3 and heading 2 the share 1 - |vx| / 4 is left."""
+    command = draw(vx, 0.3, 2.0, 1.0, narrow_speed=4.0)
+    np.testing.assert_allclose(command.velocity[:2], [vx, vy], atol=1e-6)
+    assert float(command.heading) == pytest.approx(heading, abs=1e-6)
+
+
+def test_narrowing_turns_the_short_way():
+    """From yaw 3 to heading -3 it is 0.2831853; half of that on top of 3."""
+    command = draw(2.0, 0.0, -3.0, 3.0, narrow_speed=4.0)
+    assert float(command.heading) == pytest.approx(3.1415927, abs=1e-6)
+    assert float(command.velocity[2]) == pytest.approx(0.5 * 0.1415927, abs=1e-6)
+
+
+def test_no_narrowing_by_default():
+    command = draw(3.5, 0.3, 2.0, 1.0)
+    np.testing.assert_allclose(command.velocity, [3.5, 0.3, 0.5], atol=1e-6)
+
+
+def test_stand_commands():
+    """Zero velocity, the heading it has; with `stand_still` the clock may stop."""
+    command = draw(3.0, 0.0, 2.0, 1.0, stand_fraction=1.0, stand_still=True)
+    assert command.velocity.tolist() == [0.0, 0.0, 0.0]
+    assert float(command.heading) == 1.0 and not bool(command.moving)
+    marching = draw(3.0, 0.0, 2.0, 1.0, stand_fraction=1.0)
+    assert marching.velocity.tolist() == [0.0, 0.0, 0.0] and bool(marching.moving)
+
+
+def test_forward_commands_have_no_side_speed():
+    command = draw(1.0, 0.3, 0.0, 0.0, forward_fraction=1.0)
+    np.testing.assert_allclose(command.velocity, [1.0, 0.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.xfail(
+    strict=True, reason="2026-11-23: commands.sample zeroes vy only; heading is drawn as for others"
+)
+def test_forward_commands_keep_the_heading():
+    """config.CommandConfig.forward_fraction: straight ahead, heading as it is."""
+    command = draw(1.0, 0.3, 2.0, 1.0, forward_fraction=1.0)
+    assert float(command.heading) == pytest.approx(1.0)
+    np.testing.assert_allclose(command.velocity, [1.0, 0.0, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "moving", "left"),
+    [
+        ([1.0, 0.0, 0.0], True, [1.0, 0.0, 0.0]),
+        ([0.0, -0.3, 0.05], True, [0.0, -0.3, 0.05]),
+        ([0.0, 0.0, 0.11], True, [0.0, 0.0, 0.11]),  # turns on the spot
+        ([0.0, 0.0, -0.11], True, [0.0, 0.0, -0.11]),
+        ([0.0, 0.0, 0.09], False, [0.0, 0.0, 0.0]),  # not worth a step
+        ([0.0, 0.0, 0.0], False, [0.0, 0.0, 0.0]),
+    ],
+)
+@pytest.mark.parametrize("jit", [False, True])
+def test_when_a_command_means_standing_still(velocity, moving, left, jit):
+    config = dataclasses.replace(PAPER, stand_still=True)
+    f = jax.jit(commands.with_velocity, static_argnums=0) if jit else commands.with_velocity
+    command = f(config, make_command(), jnp.asarray(velocity))
+    assert bool(command.moving) == moving
+    np.testing.assert_allclose(command.velocity, left)
+    always = commands.with_velocity(PAPER, make_command(moving=False), jnp.asarray(velocity))
+    assert bool(always.moving)
+    np.testing.assert_allclose(always.velocity, velocity)
+
+
+def test_a_standing_robot_that_drifts_turns_back():
+    """0.5 * 0.3 rad is more than 0.1 rad/s."""
+    config = dataclasses.replace(PAPER, stand_still=True)
+    command = make_command(heading=0.0, moving=False)
+    assert not bool(commands.steer(config, command, jnp.asarray(0.19)).moving)
+    drifted = commands.steer(config, command, jnp.asarray(0.3))
+    assert bool(drifted.moving)
+    np.testing.assert_allclose(drifted.velocity, [0.0, 0.0, -0.15], atol=1e-6)
+    assert not bool(commands.steer(config, drifted, jnp.asarray(0.1)).moving)
+
+
+def test_fractions_and_ranges():
+    """30 % stand, 20 % of all go straight; the rest fill their ranges. 4000 draws: +-0.03."""
+    config = dataclasses.replace(
+        PAPER, stand_fraction=0.3, forward_fraction=0.2, stand_still=True, dead_zone=0.0
+    )
+    command = draw_many(config)
+    vx, vy = command.velocity[:, 0], command.velocity[:, 1]
+    assert float(jnp.mean(vx == 0.0)) == pytest.approx(0.3, abs=0.03)
+    assert float(jnp.mean((vx != 0.0) & (vy == 0.0))) == pytest.approx(0.2, abs=0.03)
+    free = vy != 0.0
+    assert float(vx.min()) == pytest.approx(-0.3, abs=0.01)
+    assert float(vx.max()) == pytest.approx(3.5, abs=0.01)
+    assert float(vy.min()) == pytest.approx(-0.3, abs=0.01)
+    assert float(vy.max()) == pytest.approx(0.3, abs=0.01)
+    assert float(jnp.mean(vx, where=free)) == pytest.approx(1.6, abs=0.1)
+    heading = command.heading[free]
+    assert float(heading.min()) == pytest.approx(-3.14, abs=0.02)
+    assert float(heading.max()) == pytest.approx(3.14, abs=0.02)
+    assert abs(float(jnp.corrcoef(vx[free], vy[free])[0, 1])) < 0.06  # separate keys
+
+
+@settings(max_examples=30, deadline=None, derandomize=True, database=None)
+@given(st.floats(-5, 5), st.floats(0.1, 5))
+def test_speed_share(vx, v_max):
+    share = commands.speed_share(make_command(velocity=[vx, 9.0, 9.0]), jnp.asarray(v_max))
+    assert float(share) == pytest.approx(min(abs(vx) / v_max, 1.0), rel=1e-5)

@@ -1,0 +1,438 @@
+"""The paper's numbers, presets and ablations, storage, and errors that name the field."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from kslc_jax import config as config_lib
+from kslc_jax import observations
+from kslc_jax.config import (
+    ABLATIONS,
+    PRESETS,
+    Config,
+    ConfigError,
+    HighFidelity,
+    from_dict,
+    preset,
+    to_dict,
+)
+
+PAPER = preset("paper")
+LAPTOP = preset("laptop")
+BASELINE = preset("baseline")
+
+
+def changes(a: Any, b: Any, where: str = "") -> dict[str, tuple[Any, Any]]:
+    """Every field that differs, by dotted name."""
+    out = {}
+    for f in dataclasses.fields(a):
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if dataclasses.is_dataclass(x):
+            out |= changes(x, y, f"{where}{f.name}.")
+        elif x != y:
+            out[f"{where}{f.name}"] = (x, y)
+    return out
+
+
+# -------------------------------------------------------------------------- the paper, Humanoid-Gym
+
+
+def test_table_1():
+    assert PAPER.env.num_envs == 4096
+    assert PAPER.minibatch_size == 61_440
+    assert PAPER.ppo.gamma == 0.994
+    assert PAPER.ppo.lam == 0.9
+    assert PAPER.ppo.entropy_coef == 0.001
+    assert abs(PAPER.rewards.weights.angular_momentum) == 0.05
+    assert PAPER.ppo.learning_rate == 1e-5
+    assert PAPER.env.frames == 15
+    assert PAPER.env.privileged_frames == 3
+    assert observations.ACTOR_WIDTH == 59
+    assert observations.CRITIC_WIDTH == 89
+
+
+def test_table_2_and_the_action_space():
+    assert config_lib.NUM_JOINTS == 16
+    assert PAPER.env.arms == "free"
+
+
+def test_equations_2_to_8():
+    r = PAPER.rewards
+    assert r.weights.angular_momentum == 0.05  # Eq. 2
+    assert (r.weights.base_height, r.weights.feet_clearance, r.weights.joint_pos) == (0.2, 1.0, 1.6)
+    assert (r.base_height_kernel, r.base_height_drop) == (100.0, 0.05)  # Eq. 6
+    assert (r.joint_pos_kernel, r.joint_pos_penalty, r.joint_pos_clip) == (2.0, 0.2, 0.5)  # Eq. 8
+    assert r.velocity_rewards and r.only_positive
+    # Ours, where Eq. 4 and 7 leave a number open.
+    assert (r.momentum_scale, r.momentum_floor) == (5.0, -20.0)
+    assert (r.clearance_speed_gain, r.clearance_width) == (1.0, 0.01)
+
+
+def test_equations_9_and_10():
+    c = PAPER.curriculum
+    assert c.velocity and c.cycle
+    assert (c.threshold, c.v_step, c.v_limit) == (0.8, 0.5, 3.5)
+    assert (c.cycle_factor, c.cycle_min) == (0.95, 0.48)
+    # Beyond the paper.
+    assert (c.v_min, c.v_start) == (-0.3, 0.5)
+    assert (c.fast_share, c.fast_threshold, c.min_episode_steps) == (0.6, 0.7, 1000.0)
+    assert (c.smoothing, c.min_updates) == (0.95, 40)
+
+
+def test_what_the_paper_leaves_to_humanoid_gym():
+    p = PAPER.ppo
+    assert (p.rollout_steps, p.minibatches, p.epochs) == (60, 4, 2)
+    assert (p.clip, p.value_coef, p.max_grad_norm) == (0.2, 1.0, 1.0)
+    assert (p.desired_kl, p.learning_rate_factor) == (0.01, 1.5)
+    assert p.learning_rate_bounds == (1e-5, 1e-2)
+    n = PAPER.network
+    assert (n.actor, n.critic, n.init_std) == ((512, 256, 128), (768, 256, 128), 1.0)
+    assert not n.symmetric
+    e = PAPER.env
+    assert PAPER.control_dt == pytest.approx(0.01) and PAPER.episode_steps == 2400
+    assert (e.action_scale, e.action_clip, e.observation_clip) == (0.25, 18.0, 18.0)
+    assert (e.action_delay, e.action_noise, e.noise_level) == (0.5, 0.02, 0.6)
+    assert e.reset_joint_noise == 0.1
+    c = PAPER.command
+    assert (c.vy, c.heading, c.resample_seconds) == ((-0.3, 0.3), (-3.14, 3.14), 8.0)
+    assert (c.dead_zone, c.heading_gain, c.max_yaw_rate) == (0.2, 0.5, 1.0)
+    assert (c.stand_fraction, c.forward_fraction, c.narrow_speed) == (0.0, 0.0, 0.0)
+    assert not c.stand_still
+    g = PAPER.gait
+    assert (g.cycle_time, g.double_support, g.reference_scale) == (0.64, 0.1, 0.17)
+    assert (g.reference_speed_gain, g.arm_swing, g.elbow_bend) == (0.0, 0.0, 0.0)
+    assert not g.cycle_follows_speed and not g.random_phase
+    r = PAPER.randomize
+    assert (r.friction, r.ground_friction, r.base_mass) == ((0.1, 2.0), 0.6, (-5.0, 5.0))
+    assert (r.push_seconds, r.push_velocity, r.push_angular) == (4.0, 0.2, 0.4)
+    assert r.kp == r.kd == r.motor_strength == (1.0, 1.0)
+    assert r.base_com == r.joint_friction == (0.0, 0.0)
+    w = PAPER.rewards
+    assert (w.tracking_sigma, w.base_height_target, w.clearance_target) == (5.0, 0.89, 0.06)
+    assert w.max_contact_force == 700.0
+    assert (w.feet_distance, w.knee_distance) == ((0.2, 0.5), (0.2, 0.25))
+    assert (w.lateral_distance, w.lean_per_speed) == (False, 0.0)
+
+
+def test_physics_departs_from_humanoid_gym_at_the_same_control_rate():
+    p = PAPER.physics
+    assert (p.timestep, p.decimation, p.iterations, p.ls_iterations) == (0.005, 2, 4, 5)
+    assert {preset(name).physics for name in PRESETS} == {p}
+
+
+def test_evaluation_physics():
+    """The other simulator: 1 kHz, converged solver, the same 100 Hz policy; C MuJoCo only."""
+    high = HighFidelity()
+    assert (high.timestep, high.decimation, high.fidelity) == (0.001, 10, "high")
+    assert (high.iterations, high.ls_iterations) == (100, 50)
+    assert high.control_dt == pytest.approx(PAPER.control_dt)
+    with pytest.raises(ConfigError, match=r"physics\.engine"):
+        HighFidelity(engine="mjx")
+
+
+def test_base_length_of_the_papers_training():
+    """3001 iterations of 4096 x 60 samples, within 0.1 %."""
+    assert PAPER.batch_size == 245_760
+    assert PAPER.run.steps == pytest.approx(3001 * 245_760, rel=1e-3)
+    assert PAPER.num_updates == pytest.approx(3001, abs=3)
+
+
+# ------------------------------------------------------------------------------ presets, ablations
+
+
+def test_presets():
+    assert set(PRESETS) == {"paper", "laptop", "debug", "baseline", "baseline-laptop"}
+    for name in PRESETS:
+        assert preset(name) == PRESETS[name]
+
+
+def test_baseline_is_humanoid_gym():
+    assert {k: v[1] for k, v in changes(PAPER, BASELINE).items()} == {
+        "env.arms": "held",
+        "rewards.velocity_rewards": False,
+        "rewards.weights.angular_momentum": 0.0,
+        "curriculum.velocity": False,
+        "curriculum.cycle": False,
+        "curriculum.v_start": 3.5,
+    }
+
+
+LEARNER = {
+    "env.num_envs": 2048,
+    "env.frames": 5,
+    "network.actor": (256, 128, 64),
+    "network.critic": (256, 128, 64),
+    "network.init_std": 0.6,
+    "ppo.rollout_steps": 24,
+    "ppo.epochs": 5,
+    "ppo.entropy_coef": 0.003,
+    "ppo.learning_rate": 1e-3,
+    "ppo.learning_rate_bounds": (1e-5, 1e-3),
+    "run.steps": 40_000_000,
+}
+
+
+def test_laptop_departs_from_the_paper_in_these_numbers_only():
+    """docs/fidelity.md, "The laptop preset", gives the reason of each."""
+    assert {k: v[1] for k, v in changes(PAPER, LAPTOP).items()} == LEARNER | {
+        "network.symmetric": True,
+        "command.stand_fraction": 0.1,
+        "command.forward_fraction": 0.2,
+        "command.narrow_speed": 4.0,
+        "command.stand_still": True,
+        "gait.reference_speed_gain": 1.0,
+        "gait.arm_swing": 0.5,
+        "gait.elbow_bend": 1.0,
+        "gait.cycle_follows_speed": True,
+        "gait.random_phase": True,
+        "rewards.base_height_kernel": 30.0,
+        "rewards.clearance_width": 0.03,
+        "rewards.max_contact_force": 1400.0,
+        "rewards.lateral_distance": True,
+        "rewards.lean_per_speed": 0.03,
+        "rewards.weights.tracking_lin_vel": 1.6,
+        "rewards.weights.track_vel_hard": 0.8,
+        "rewards.weights.dof_vel_limits": -0.5,
+        "rewards.weights.stand_still": -0.3,
+    }
+    assert LAPTOP.minibatch_size == 12_288
+
+
+def test_baseline_laptop_is_the_baseline_with_the_laptops_learner():
+    found = changes(BASELINE, preset("baseline-laptop"))
+    assert {k: v[1] for k, v in found.items()} == LEARNER
+
+
+def test_debug_is_a_small_laptop():
+    found = changes(LAPTOP, preset("debug"))
+    assert {k: v[1] for k, v in found.items()} == {
+        "env.num_envs": 16,
+        "env.frames": 3,
+        "network.actor": (32, 16),
+        "network.critic": (32, 16),
+        "ppo.rollout_steps": 8,
+        "ppo.minibatches": 2,
+        "ppo.epochs": 2,
+        "run.steps": 1024,
+        "run.checkpoint_minutes": 0.05,
+    }
+
+
+@pytest.mark.parametrize("base", ["paper", "laptop"])
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("arms", {"env.arms": "held"}),
+        ("angular-momentum", {"rewards.weights.angular_momentum": 0.0}),
+        ("velocity-rewards", {"rewards.velocity_rewards": False}),
+        ("velocity-curriculum", {"curriculum.velocity": False, "curriculum.v_start": 3.5}),
+        ("cycle-curriculum", {"curriculum.cycle": False}),
+    ],
+)
+def test_an_ablation_is_one_switch(base, name, expected):
+    found = changes(preset(base), preset(base, (name,)))
+    assert {k: v[1] for k, v in found.items()} == expected
+
+
+def test_all_ablations_at_once():
+    assert len(ABLATIONS) == 5
+    stripped = preset("paper", tuple(ABLATIONS))
+    assert stripped == BASELINE
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_presets_are_static_arguments(name):
+    """Hashable, compared by value; the host's side of a run is no part of it."""
+    config = preset(name)
+    same = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=7))
+    assert hash(config) == hash(same) and config == same
+    assert config != dataclasses.replace(config, seed=config.seed + 1)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.seed = 1
+
+
+def test_config_needs_no_jax():
+    code = "import sys, kslc_jax.config; sys.exit('jax' in sys.modules or 'mujoco' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_derived_numbers():
+    config = preset("debug")
+    assert config.batch_size == 128 and config.minibatch_size == 64
+    assert config.num_updates == 8  # 1024 / 128
+    longer = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=1025))
+    assert longer.num_updates == 9
+
+
+# ----------------------------------------------------------------------------------------- storage
+
+
+@pytest.mark.parametrize("name", list(PRESETS))
+def test_round_trip_through_json(name):
+    config = dataclasses.replace(preset(name, ("arms",)), seed=3)
+    config = dataclasses.replace(config, run=dataclasses.replace(config.run, keep=9))
+    back = from_dict(json.loads(json.dumps(to_dict(config))))
+    assert back == config and hash(back) == hash(config)
+    assert back.run == config.run  # not part of ==
+    assert to_dict(config)["schema"] == 1
+
+
+def edited(path: str, value: Any = None, *, remove: bool = False) -> dict[str, Any]:
+    data = json.loads(json.dumps(to_dict(PAPER)))
+    *parents, last = path.split(".")
+    at = data
+    for name in parents:
+        at = at[name]
+    if remove:
+        del at[last]
+    else:
+        at[last] = value
+    return data
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("ppo.gama", 0.9, "config.ppo: unknown field gama"),
+        ("extra", 1, "config: unknown field extra"),
+        ("env.num_envs", "many", 'config.env.num_envs: "many" is not a valid value'),
+        ("env.num_envs", 4096.5, "config.env.num_envs: 4096.5 is not a valid value"),
+        ("env.num_envs", True, "config.env.num_envs: true is not a valid value"),
+        ("env.arms", "folded", 'config.env.arms: "folded" is not a valid value'),
+        ("ppo.gamma", None, "config.ppo.gamma: null is not a valid value"),
+        ("ppo.gamma", False, "config.ppo.gamma: false is not a valid value"),
+        ("rewards.only_positive", 1, "config.rewards.only_positive: 1 is not a valid value"),
+        ("command.vy", 0.3, "config.command.vy: 0.3 is not a valid value"),
+        (
+            "command.vy",
+            [0.1, 0.2, 0.3],
+            r"config.command.vy: \[0.1, 0.2, 0.3\] is not a valid value",
+        ),
+        ("command.vy", [0.1, "b"], 'config.command.vy: "b" is not a valid value'),
+        ("network.actor", [64, 0.5], "config.network.actor: 0.5 is not a valid value"),
+        ("rewards.weights", 3, "config.rewards.weights: expected an object, got int"),
+        ("schema", 2, "schema version 2, this kslc_jax reads version 1"),
+        ("schema", None, "schema version None"),
+        ("command.vy", [0.3, -0.3], "command.vy: lower bound 0.3 is above upper bound -0.3"),
+    ],
+)
+def test_wrong_stored_field_is_named(path, value, message):
+    with pytest.raises(ConfigError, match=message):
+        from_dict(edited(path, value))
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("ppo.gamma", "config.ppo: missing field gamma"),
+        ("rewards.weights.torques", "config.rewards.weights: missing field torques"),
+        ("gait", "config: missing field gait"),
+        ("schema", "schema version None"),
+    ],
+)
+def test_missing_stored_field_is_named(path, message):
+    with pytest.raises(ConfigError, match=message):
+        from_dict(edited(path, remove=True))
+
+
+def test_stored_config_must_be_an_object():
+    with pytest.raises(ConfigError, match="not a JSON object"):
+        from_dict([1, 2])  # ty: ignore[invalid-argument-type]
+
+
+def test_whole_numbers_are_read_as_floats():
+    config = from_dict(edited("ppo.gamma", 1))
+    assert config.ppo.gamma == 1.0 and type(config.ppo.gamma) is float
+    assert type(from_dict(edited("command.vy", [-1, 1])).command.vy[0]) is float
+
+
+def test_reading_does_not_change_its_argument():
+    data = to_dict(PAPER)
+    from_dict(data)
+    assert data == to_dict(PAPER)
+
+
+# ------------------------------------------------------------------------------------------ errors
+
+
+@pytest.mark.parametrize(
+    ("name", "without", "message"),
+    [
+        ("papr", (), "unknown preset 'papr', did you mean 'paper'"),
+        ("labtop", (), "did you mean 'laptop'"),
+        ("xyzzy", (), r"unknown preset 'xyzzy' \(known: paper, laptop, debug, baseline"),
+        ("paper", ("arm",), "unknown ablation 'arm', did you mean 'arms'"),
+        ("paper", ("momentum",), "unknown ablation 'momentum', did you mean 'angular-momentum'"),
+    ],
+)
+def test_unknown_names(name, without, message):
+    with pytest.raises(ConfigError, match=message):
+        preset(name, without)
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value"),
+    [
+        ("physics", "timestep", 0.0),
+        ("physics", "decimation", 0),
+        ("physics", "iterations", 0),
+        ("physics", "ls_iterations", 0),
+        ("physics", "threads", -1),
+        ("env", "num_envs", 0),
+        ("env", "episode_seconds", 0.0),
+        ("env", "frames", 0),
+        ("env", "privileged_frames", 0),
+        ("env", "action_delay", 1.1),
+        ("command", "vy", (0.3, -0.3)),
+        ("command", "heading", (1.0, 0.0)),
+        ("command", "resample_seconds", 0.0),
+        ("command", "stand_fraction", 1.1),
+        ("command", "forward_fraction", -0.1),
+        ("gait", "cycle_time", 0.0),
+        ("gait", "double_support", 1.0),
+        ("gait", "full_speed", 0.0),
+        ("randomize", "friction", (2.0, 0.1)),
+        ("randomize", "friction", (-0.1, 0.1)),
+        ("randomize", "base_mass", (5.0, -5.0)),
+        ("randomize", "kp", (-0.1, 1.0)),
+        ("rewards", "momentum_scale", 0.0),
+        ("rewards", "momentum_floor", 0.0),
+        ("rewards", "clearance_width", 0.0),
+        ("curriculum", "cycle_factor", 1.1),
+        ("curriculum", "v_step", 0.0),
+        ("curriculum", "v_start", 4.0),
+        ("curriculum", "v_min", 1.0),
+        ("curriculum", "smoothing", 1.0),
+        ("network", "actor", (64, 0)),
+        ("network", "init_std", 0.0),
+        ("ppo", "rollout_steps", 0),
+        ("ppo", "minibatches", 0),
+        ("ppo", "epochs", 0),
+        ("ppo", "gamma", 1.1),
+        ("ppo", "lam", -0.1),
+        ("ppo", "learning_rate_bounds", (1e-2, 1e-5)),
+        ("run", "steps", 0),
+        ("run", "log_every", 0),
+        ("run", "checkpoint_minutes", 0.0),
+        ("run", "keep", 0),
+    ],
+)
+def test_bad_values_are_refused(part, field, value):
+    """The message names the field, or for two that must agree, the part."""
+    with pytest.raises(ConfigError, match=f"{part}") as error:
+        dataclasses.replace(getattr(PAPER, part), **{field: value})
+    assert field in str(error.value) or part == "network"
+
+
+def test_batch_must_split_into_minibatches():
+    with pytest.raises(ConfigError, match="7 does not divide the batch of 4096 envs x 60 steps"):
+        dataclasses.replace(PAPER, ppo=dataclasses.replace(PAPER.ppo, minibatches=7))
+
+
+def test_seed_must_not_be_negative():
+    with pytest.raises(ConfigError, match="seed"):
+        Config(seed=-1)

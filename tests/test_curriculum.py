@@ -1,0 +1,153 @@
+"""Curriculum: averages by hand, each gate on its own, the paper's steps and limits."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import curriculum
+from kslc_jax.config import preset
+from kslc_jax.curriculum import Curriculum, Progress
+
+PAPER = preset("paper")
+CONFIG = PAPER.curriculum
+# Averages follow at once, so that one update shows the gate.
+DIRECT = dataclasses.replace(CONFIG, smoothing=0.0)
+
+
+def state(**changes) -> Curriculum:
+    start = curriculum.init(PAPER)
+    return start.replace(**{k: jnp.asarray(v, getattr(start, k).dtype) for k, v in changes.items()})
+
+
+def progress(tracking=0.85, fast=0.75, fast_count=10, steps=1500.0, count=5) -> Progress:
+    values = (tracking, fast, fast_count, steps, count)
+    return Progress(*(jnp.asarray(v, jnp.float32) for v in values))
+
+
+READY = dict(updates=100)
+
+
+def test_start():
+    start = curriculum.init(PAPER)
+    assert float(start.v_max) == 0.5
+    assert float(start.cycle_time) == pytest.approx(0.64)
+    assert float(start.tracking) == float(start.fast_tracking) == float(start.episode_steps) == 0.0
+    assert int(start.updates) == 0
+
+
+def test_averages_by_hand():
+    """0.95 of the old and 0.05 of the new: 0.05 * 0.8 = 0.04; 0.95 * 0.04 + 0.05 * 0.6 = 0.068."""
+    one = curriculum.update(CONFIG, state(), progress(0.8, 0.4, 3, 200.0, 2))
+    assert float(one.tracking) == pytest.approx(0.04)
+    assert float(one.fast_tracking) == pytest.approx(0.02)
+    assert float(one.episode_steps) == pytest.approx(10.0)
+    assert int(one.updates) == 1
+    two = curriculum.update(CONFIG, one, progress(0.6, 0.6, 3, 400.0, 1))
+    assert float(two.tracking) == pytest.approx(0.068)
+    assert float(two.fast_tracking) == pytest.approx(0.049)  # 0.019 + 0.03
+    assert float(two.episode_steps) == pytest.approx(29.5)  # 9.5 + 20
+    assert int(two.updates) == 2
+
+
+def test_averages_skip_what_was_not_seen():
+    """No fast command and no finished episode leave their averages as they are."""
+    old = state(tracking=0.5, fast_tracking=0.6, episode_steps=700.0)
+    new = curriculum.update(CONFIG, old, progress(0.7, 0.0, 0, 0.0, 0))
+    assert float(new.tracking) == pytest.approx(0.51)
+    assert float(new.fast_tracking) == pytest.approx(0.6)
+    assert float(new.episode_steps) == pytest.approx(700.0)
+
+
+@pytest.mark.parametrize("jit", [False, True])
+def test_open_gate_steps_both(jit):
+    update = jax.jit(curriculum.update, static_argnums=0) if jit else curriculum.update
+    new = update(DIRECT, state(**READY), progress())
+    assert float(new.v_max) == 1.0
+    assert float(new.cycle_time) == pytest.approx(0.608)
+    assert int(new.updates) == 0 and float(new.fast_tracking) == 0.0
+    assert float(new.tracking) == pytest.approx(0.85)  # keeps its average
+    assert float(new.episode_steps) == pytest.approx(1500.0)
+
+
+@pytest.mark.parametrize(
+    ("closed", "open_"),
+    [
+        (progress(tracking=0.799), progress(tracking=0.801)),
+        (progress(fast=0.699), progress(fast=0.701)),
+        (progress(steps=999.0), progress(steps=1000.0)),
+    ],
+    ids=["tracking", "fast", "episodes"],
+)
+def test_each_gate_alone_keeps_everything(closed, open_):
+    new = curriculum.update(DIRECT, state(**READY), closed)
+    assert float(new.v_max) == 0.5 and float(new.cycle_time) == pytest.approx(0.64)
+    assert int(new.updates) == 101
+    assert float(new.fast_tracking) == pytest.approx(float(closed.fast_tracking))
+    assert float(curriculum.update(DIRECT, state(**READY), open_).v_max) == 1.0
+
+
+@pytest.mark.parametrize(("updates", "v_max"), [(38, 0.5), (39, 1.0), (0, 0.5)])
+def test_some_updates_between_two_changes(updates, v_max):
+    """The 40th update after a change may make the next."""
+    new = curriculum.update(DIRECT, state(updates=updates), progress())
+    assert float(new.v_max) == v_max
+    assert int(new.updates) == (0 if v_max == 1.0 else updates + 1)
+
+
+def test_the_whole_way_of_the_paper():
+    """+0.5 m/s up to 3.5; x 0.95 down to 0.48: 0.64 * 0.95^6 would be 0.47046."""
+    current, speeds, cycles, changes = state(), [], [], 0
+    update = jax.jit(curriculum.update, static_argnums=0)
+    for _ in range(400):
+        new = update(DIRECT, current, progress())
+        if float(new.v_max) != float(current.v_max) or float(new.cycle_time) != float(
+            current.cycle_time
+        ):
+            speeds.append(float(new.v_max))
+            cycles.append(float(new.cycle_time))
+            changes += 1
+        current = new
+    np.testing.assert_allclose(speeds, [1.0, 1.5, 2.0, 2.5, 3.0, 3.5])
+    np.testing.assert_allclose(
+        cycles, [0.608, 0.5776, 0.54872, 0.521284, 0.4952198, 0.48], rtol=1e-5
+    )
+    assert changes == 6
+    assert int(current.updates) == 400 - 6 * 40  # the end is not counted as a change
+    assert float(current.fast_tracking) == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "cycle", "v_max", "cycle_time"),
+    [(True, False, 1.0, 0.64), (False, True, 0.5, 0.608), (False, False, 0.5, 0.64)],
+)
+def test_each_curriculum_can_be_switched_off(velocity, cycle, v_max, cycle_time):
+    config = dataclasses.replace(DIRECT, velocity=velocity, cycle=cycle)
+    new = curriculum.update(config, state(**READY), progress())
+    assert float(new.v_max) == v_max
+    assert float(new.cycle_time) == pytest.approx(cycle_time)
+    assert int(new.updates) == (0 if velocity or cycle else 101)
+
+
+def test_the_last_step_stops_at_the_limit():
+    new = curriculum.update(DIRECT, state(v_max=3.3, cycle_time=0.5, **READY), progress())
+    assert float(new.v_max) == 3.5 and float(new.cycle_time) == pytest.approx(0.48)
+
+
+@pytest.mark.parametrize(("vx", "fast"), [(1.19, False), (1.21, True), (-1.9, False), (2.0, True)])
+def test_fast_commands_are_above_60_percent_of_the_range(vx, fast):
+    assert bool(curriculum.is_fast(CONFIG, state(v_max=2.0), jnp.asarray(vx))) == fast
+
+
+def test_start_average_cannot_open_the_gate_early():
+    """From 0, tracking 0.85 passes 0.8 when 0.95^n < 1 - 0.8 / 0.85: after 56 updates.
+
+    The fast average and the episodes are above their gates by then.
+    """
+    current, n = state(), 0
+    update = jax.jit(curriculum.update, static_argnums=0)
+    while float(current.v_max) == 0.5 and n < 200:
+        current, n = update(CONFIG, current, progress(0.85, 0.85, 10, 2000.0, 5)), n + 1
+    assert n == 56

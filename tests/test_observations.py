@@ -1,0 +1,342 @@
+"""Frames against literal tables: order, scales, noise, history and mirroring."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from states import make_command, make_gait, make_signals
+
+from kslc_jax import gait, observations, randomize, robot, signals
+from kslc_jax.config import EnvConfig, PhysicsConfig, preset
+from kslc_jax.observations import ACTOR, CRITIC
+from kslc_jax.physics import PhysicsState, initial_state
+
+KEY = jax.random.key(0)
+QUIET = EnvConfig(noise_level=0.0)
+
+# Distinct numbers for everything a frame holds.
+Q = 0.01 * np.arange(1, 17)
+DQ = 1.0 + 0.1 * np.arange(16)
+ACTION = -2.0 + 0.2 * np.arange(16)
+REFERENCE = 0.3 - 0.02 * np.arange(16)
+
+
+def make_sources(**changes) -> observations.Sources:
+    parts = dict(
+        signals=make_signals(
+            joint_pos=Q,
+            joint_vel=DQ,
+            base_linvel=[1.5, -0.2, 0.1],
+            base_angvel=[0.3, -0.4, 0.5],
+            base_euler=[0.01, 0.02, -3.0],
+            foot_contact=[True, False],
+        ),
+        gait=make_gait(clock=[0.6, 0.8], stance=[False, True]),
+        command=make_command(velocity=[2.0, -0.3, 0.7]),
+        dynamics=randomize.nominal(friction=1.3),
+        reference=jnp.asarray(REFERENCE, jnp.float32),
+        last_action=jnp.asarray(ACTION, jnp.float32),
+        push=jnp.array([0.11, -0.12, 0.21, -0.22, 0.23]),
+        base_mass=jnp.asarray(24.0),
+    )
+    return observations.Sources(**{**parts, **changes})
+
+
+# ------------------------------------------------------------------------------------------ tables
+
+
+def test_widths():
+    assert observations.ACTOR_WIDTH == 59 and observations.CRITIC_WIDTH == 89
+    assert observations.width(ACTOR) == 59 and observations.width(CRITIC) == 89
+
+
+# The paper's Table II: component, dims, in the observation, in the state.
+TABLE_II = [
+    (("clock",), 2, True),
+    (("command",), 3, True),
+    (("joint_pos",), 16, True),
+    (("joint_vel",), 16, True),
+    (("base_angvel",), 3, True),
+    (("base_euler",), 3, True),
+    (("last_action",), 16, True),
+    (("friction",), 1, False),
+    (("base_mass",), 1, False),
+    (("base_linvel",), 3, False),
+    (("push_linear",), 2, False),
+    (("push_angular",), 3, False),
+    (("tracking_difference",), 16, False),
+    (("stance",), 2, False),
+    (("contact",), 2, False),
+]
+
+
+def test_components_are_the_papers_table_2():
+    actor = {c.name: c.width for c in ACTOR}
+    critic = {c.name: c.width for c in CRITIC}
+    assert actor == {n[0]: dims for n, dims, seen in TABLE_II if seen}
+    assert critic == {n[0]: dims for n, dims, _ in TABLE_II}
+
+
+def test_slices():
+    actor, critic = observations.slices(ACTOR), observations.slices(CRITIC)
+    assert {n: (s.start, s.stop) for n, s in actor.items()} == {
+        "clock": (0, 2),
+        "command": (2, 5),
+        "joint_pos": (5, 21),
+        "joint_vel": (21, 37),
+        "last_action": (37, 53),
+        "base_angvel": (53, 56),
+        "base_euler": (56, 59),
+    }
+    assert {n: (s.start, s.stop) for n, s in critic.items()} == {
+        "clock": (0, 2),
+        "command": (2, 5),
+        "joint_pos": (5, 21),
+        "joint_vel": (21, 37),
+        "last_action": (37, 53),
+        "tracking_difference": (53, 69),
+        "base_linvel": (69, 72),
+        "base_angvel": (72, 75),
+        "base_euler": (75, 78),
+        "push_linear": (78, 80),
+        "push_angular": (80, 83),
+        "friction": (83, 84),
+        "base_mass": (84, 85),
+        "stance": (85, 87),
+        "contact": (87, 89),
+    }
+
+
+def test_every_component_has_a_value():
+    values = observations._values(make_sources())
+    for table in (ACTOR, CRITIC):
+        for c in table:
+            assert values[c.name].shape == (c.width,), c.name
+
+
+# ------------------------------------------------------------------------------------------ frames
+
+# vx, vy x 2, yaw rate x 1; joint speed x 0.05; linear velocity x 2; mass / 30.
+ACTOR_FRAME = np.concatenate(
+    [[0.6, 0.8], [4.0, -0.6, 0.7], Q, 0.05 * DQ, ACTION, [0.3, -0.4, 0.5], [0.01, 0.02, -3.0]]
+)
+CRITIC_FRAME = np.concatenate(
+    [
+        ACTOR_FRAME[:53],
+        Q - REFERENCE,
+        [3.0, -0.4, 0.2],
+        [0.3, -0.4, 0.5],
+        [0.01, 0.02, -3.0],
+        [0.11, -0.12],
+        [0.21, -0.22, 0.23],
+        [1.3],
+        [0.8],
+        [0.0, 1.0],
+        [1.0, 0.0],
+    ]
+)
+
+
+@pytest.mark.parametrize("jit", [False, True])
+def test_frames_by_hand(jit):
+    actor = lambda src: observations.actor_frame(QUIET, src, KEY)  # noqa: E731
+    critic = lambda src: observations.critic_frame(EnvConfig(), src)  # noqa: E731
+    actor, critic = (jax.jit(f) if jit else f for f in (actor, critic))
+    np.testing.assert_allclose(actor(make_sources()), ACTOR_FRAME, atol=1e-6)
+    np.testing.assert_allclose(critic(make_sources()), CRITIC_FRAME, atol=1e-6)
+
+
+def test_frames_are_clipped_at_18():
+    src = make_sources(
+        signals=make_signals(joint_vel=np.full(16, 500.0), joint_pos=np.full(16, -30.0)),
+        last_action=jnp.full(16, 17.5),
+    )
+    frame = observations.actor_frame(EnvConfig(), src, KEY)
+    np.testing.assert_array_equal(frame[21:37], np.full(16, 18.0))
+    np.testing.assert_array_equal(frame[5:21], np.full(16, -18.0))
+    np.testing.assert_array_equal(frame[37:53], np.full(16, 17.5))
+    critic = observations.critic_frame(EnvConfig(observation_clip=3.0), src)
+    assert float(jnp.max(jnp.abs(critic))) == 3.0
+
+
+# Level 0.6 times 0.05, 0.5 (on top of the scale 0.05), 0.1 and 0.03.
+NOISE = np.concatenate(
+    [np.zeros(5), np.full(16, 0.03), np.full(16, 0.015), np.zeros(16), [0.06] * 3, [0.018] * 3]
+)
+
+
+@pytest.fixture(scope="module")
+def noisy():
+    """Deviations of 4000 noisy frames from the clean one: [4000, 59], at level 0.6."""
+    frame = jax.jit(
+        jax.vmap(lambda key: observations.actor_frame(EnvConfig(), make_sources(), key))
+    )
+    return np.asarray(frame(jax.random.split(KEY, 4000))) - ACTOR_FRAME
+
+
+def test_noise_has_the_tables_size(noisy):
+    np.testing.assert_allclose(noisy.std(axis=0), NOISE, rtol=0.05, atol=1e-6)
+    np.testing.assert_allclose(noisy.mean(axis=0), 0.0, atol=0.06 * 5 / np.sqrt(4000))
+
+
+def test_noise_is_gaussian_and_independent(noisy):
+    """5 % lie beyond two deviations, and no two numbers share their noise."""
+    z = noisy[:, NOISE > 0] / NOISE[NOISE > 0]
+    assert np.mean(np.abs(z) > 1.959964) == pytest.approx(0.05, abs=0.003)
+    correlation = np.corrcoef(z.T) - np.eye(z.shape[1])
+    assert np.abs(correlation).max() < 0.08
+
+
+def test_noise_level_scales_all_of_it():
+    key = jax.random.key(1)
+    one, two = (
+        observations.actor_frame(EnvConfig(noise_level=level), make_sources(), key) - ACTOR_FRAME
+        for level in (0.5, 1.0)
+    )
+    np.testing.assert_allclose(two, 2 * one, atol=2e-6)
+    assert float(jnp.max(jnp.abs(one))) > 0.01
+
+
+# ----------------------------------------------------------------------------------------- history
+
+
+def test_history_is_oldest_first():
+    history = jnp.zeros((3, 2))
+    for i in range(1, 6):
+        history = observations.push_history(history, jnp.full(2, float(i)))
+        newest = [max(i - 2, 0), max(i - 1, 0), i]
+        np.testing.assert_array_equal(history[:, 0], newest)
+
+
+def test_presets_have_the_papers_history():
+    paper = preset("paper").env
+    assert (paper.frames, paper.privileged_frames) == (15, 3)
+
+
+# ------------------------------------------------------------------------------------------ mirror
+
+# By hand: swap the sides, negate every joint. Legs are 0 to 5 and 6 to 11, arms 12, 13 and 14, 15.
+PARTNER = [6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5, 14, 15, 12, 13]
+
+
+def mirrored(x: np.ndarray) -> np.ndarray:
+    return -np.asarray(x)[PARTNER]
+
+
+@pytest.mark.parametrize("table", [ACTOR, CRITIC], ids=["actor", "critic"])
+def test_mirroring_twice_changes_nothing(table):
+    permutation, sign = observations.mirror_map(table)
+    n = observations.width(table)
+    assert sorted(permutation) == list(range(n))
+    assert set(sign.tolist()) == {-1.0, 1.0}
+    np.testing.assert_array_equal(permutation[permutation], np.arange(n))
+    np.testing.assert_array_equal(sign * sign[permutation], np.ones(n))
+
+
+@settings(max_examples=20, deadline=None, derandomize=True, database=None)
+@given(st.lists(st.floats(-18, 18, width=32), min_size=59, max_size=59))
+def test_mirror_is_an_involution_on_any_frame(values):
+    permutation, sign = observations.mirror_map(ACTOR)
+    x = np.asarray(values, np.float32)
+    np.testing.assert_array_equal((x[permutation] * sign)[permutation] * sign, x)
+
+
+def mirrored_sources() -> observations.Sources:
+    """The sources of the robot seen in a mirror that stands along its x-z plane."""
+    return make_sources(
+        signals=make_signals(
+            joint_pos=mirrored(Q),
+            joint_vel=mirrored(DQ),
+            base_linvel=[1.5, 0.2, 0.1],
+            base_angvel=[-0.3, -0.4, -0.5],
+            base_euler=[-0.01, 0.02, 3.0],
+            foot_contact=[False, True],
+        ),
+        gait=make_gait(clock=[-0.6, -0.8], stance=[True, False]),
+        command=make_command(velocity=[2.0, 0.3, -0.7]),
+        reference=jnp.asarray(mirrored(REFERENCE), jnp.float32),
+        last_action=jnp.asarray(mirrored(ACTION), jnp.float32),
+        push=jnp.array([0.11, 0.12, -0.21, -0.22, -0.23]),
+    )
+
+
+def frames(src: observations.Sources):
+    return (
+        (ACTOR, observations.actor_frame(QUIET, src, KEY)),
+        (CRITIC, observations.critic_frame(QUIET, src)),
+    )
+
+
+def test_frame_of_the_mirrored_state_is_the_mirrored_frame():
+    for (table, here), (_, there) in zip(
+        frames(make_sources()), frames(mirrored_sources()), strict=True
+    ):
+        permutation, sign = observations.mirror_map(table)
+        np.testing.assert_allclose(here[permutation] * sign, there, atol=1e-6)
+        assert float(jnp.max(jnp.abs(here - there))) > 1.0
+
+
+def test_mirrored_physics_gives_the_mirrored_frame(xbot):
+    """From qpos and qvel through signals and gait: y, roll, yaw and their rates change sign."""
+    config = PhysicsConfig()
+    rng = np.random.default_rng(0)
+    q, dq = rng.uniform(-0.5, 0.5, 16), rng.uniform(-5, 5, 16)
+    quat = np.array([0.9, 0.1, -0.3, 0.2])
+    quat /= np.linalg.norm(quat)
+    linear, angular = rng.normal(size=3), rng.normal(size=3)
+
+    def state(position, quat, linear, angular, q, dq, touch) -> PhysicsState:
+        qpos = jnp.asarray(np.concatenate([position, quat, q]), jnp.float32)
+        qvel = jnp.asarray(np.concatenate([linear, angular, dq]), jnp.float32)
+        start = initial_state(config, qpos, qvel)
+        data = start.sensordata
+        for side, force in zip(("left", "right"), touch, strict=True):
+            data = data.at[xbot.sensor(f"{side}_foot_touch")].set(force)
+        return start.replace(sensordata=data)
+
+    flip = np.array([1.0, -1.0, 1.0])
+    here = state([1.0, 2.0, 0.9], quat, linear, angular, q, dq, (100.0, 0.0))
+    there = state(
+        [1.0, -2.0, 0.9],
+        quat * [1, -1, 1, -1],
+        linear * flip,
+        angular * -flip,
+        mirrored(q),
+        mirrored(dq),
+        (0.0, 100.0),
+    )
+
+    def source(physics, phase, command, action, push):
+        now = signals.read(xbot, physics)
+        clock = gait.update(
+            preset("paper").gait, make_gait(phase=phase), now, command, jnp.asarray(1e9), 0.01
+        )
+        return make_sources(
+            signals=now,
+            gait=clock,
+            command=command,
+            reference=gait.reference_pose(preset("laptop").gait, xbot, clock, command),
+            last_action=jnp.asarray(action, jnp.float32),
+            push=jnp.asarray(push),
+        )
+
+    one = source(
+        here, 0.2, make_command(velocity=[2.0, 0.2, 0.3]), ACTION, [0.1, 0.2, 0.3, 0.4, 0.5]
+    )
+    two = source(
+        there,
+        0.7,
+        make_command(velocity=[2.0, -0.2, -0.3]),
+        mirrored(ACTION),
+        [0.1, -0.2, -0.3, 0.4, -0.5],
+    )
+    for (table, a), (_, b) in zip(frames(one), frames(two), strict=True):
+        permutation, sign = observations.mirror_map(table)
+        np.testing.assert_allclose(a[permutation] * sign, b, atol=1e-5)
+
+
+def test_mirror_of_the_joints_is_the_robots():
+    permutation, sign = robot.mirror_joints()
+    assert permutation.tolist() == PARTNER and sign.tolist() == [-1.0] * 16
