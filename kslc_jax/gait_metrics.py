@@ -1,7 +1,7 @@
 """Numbers that describe how a robot moves, from a `Trace`; numpy only.
 
 All take the trace of one commanded speed, [T, N, ...], and count only trials that did not fall,
-after a second to settle; `summary` puts them together.
+after some time to settle; `summary` puts them together.
 """
 
 import numpy as np
@@ -11,7 +11,7 @@ from kslc_jax.trials import Trace
 
 GRAVITY = 9.81
 SETTLE = 2.0
-"""Seconds at the start that do not count."""
+"""Seconds at the start that do not count: the robot gathers speed."""
 
 
 def _steady(trace: Trace, dt: float) -> Trace:
@@ -42,6 +42,9 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
     out = {
         "survival": float(upright.mean()),
         "forward_mean": float(mean.mean()),
+        "forward_mean_ci": float(1.96 * mean.std(ddof=1) / np.sqrt(len(mean)))
+        if len(mean) > 1
+        else 0.0,
         "forward_rmse": float(np.sqrt(np.mean((mean - command) ** 2))),
     }
     s = _steady(trace, dt)

@@ -109,6 +109,10 @@ def test_slices():
     }
 
 
+def test_the_critic_sees_without_noise():
+    assert [c.noise for c in CRITIC] == [0.0] * 15
+
+
 def test_every_component_has_a_value():
     values = observations._values(make_sources())
     for table in (ACTOR, CRITIC):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kslc_jax import physics, randomize, robot
-from kslc_jax.config import PhysicsConfig, RandomizeConfig
+from kslc_jax.config import HighFidelity, PhysicsConfig, RandomizeConfig
 
 ENGINES = ("mjx", "mujoco")
 GROUND = 0.6
@@ -81,11 +81,14 @@ def test_servo_control_inverts_the_models_servo(xbot):
     np.testing.assert_allclose(xbot.kp * (ctrl - q) - xbot.kd * dq, torque, rtol=1e-9)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_no_motor_drives_a_joint_past_its_speed_limit(engine):
+@pytest.mark.parametrize(
+    "config",
+    [PhysicsConfig(engine="mjx"), PhysicsConfig(engine="mujoco"), HighFidelity()],
+    ids=["mjx", "mujoco", "high fidelity"],
+)
+def test_no_motor_drives_a_joint_past_its_speed_limit(config):
     """Shoulders at full command in the air: 7 rad/s is approached, not passed."""
-    step = make_step(engine)
-    config = PhysicsConfig(engine=engine)
+    step = jax.jit(lambda s, t, d: physics.step(config, s, t, d, GROUND))
     state = standing(config)
     state = state.replace(qpos=state.qpos.at[2].set(3.0))
     target = jnp.zeros(16).at[jnp.array([12, 14])].set(jnp.array([-3.1, 3.1]))

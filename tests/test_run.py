@@ -100,9 +100,17 @@ def wait_for(path: Path, lines: int, process):
     raise AssertionError("no progress")
 
 
-@pytest.mark.parametrize("sig", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_killed_run_resumes_with_the_same_numbers(sig, tmp_path):
-    """Killed in mid-run: what follows from the last checkpoint equals an unkilled run."""
+@pytest.fixture(scope="module")
+def unkilled(tmp_path_factory):
+    """Records of a long run that nobody disturbed."""
+    run_dir = tmp_path_factory.mktemp("runs") / "unkilled"
+    cli(*DEBUG, "--run-dir", run_dir, "--steps", 600 * 128)
+    return numbers(records(run_dir))
+
+
+@pytest.mark.parametrize("sig", [signal.SIGKILL, signal.SIGTERM])
+def test_killed_run_resumes_with_the_same_numbers(sig, unkilled, tmp_path):
+    """Killed in mid-run: what follows from the last checkpoint equals the unkilled run."""
     run_dir = tmp_path / "r"
     args = [*DEBUG, "--run-dir", str(run_dir), "--steps", "1000000"]
     args += ["--run.checkpoint-minutes", "0.005"]
@@ -122,9 +130,15 @@ def test_killed_run_resumes_with_the_same_numbers(sig, tmp_path):
     assert steps
     until = steps[-1] + 5
     cli("--resume", "--run-dir", run_dir, "--steps", until * 128)
-    unkilled = tmp_path / "u"
-    cli(*DEBUG, "--run-dir", unkilled, "--steps", until * 128)
-    assert numbers(records(run_dir)) == numbers(records(unkilled))
+    assert numbers(records(run_dir)) == unkilled[:until]
+
+
+def test_first_signal_asks_second_interrupts():
+    with runner._Stop() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.requested == "SIGINT"
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
 
 
 def test_load_policy(whole):
@@ -158,61 +172,69 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(whole, tmp_path):
     assert [r["step"] for r in records(run_dir)] == list(range(1, 12))
 
 
-def fails(*args, **kwargs):
-    """One line on stderr that starts with 'error:', exit code 2, no traceback."""
-    done = cli(*args, check=False, **kwargs)
-    assert done.returncode == 2, done.stdout + done.stderr
-    lines = done.stderr.strip().splitlines()
-    assert len(lines) == 1 and lines[0].startswith("error: "), done.stderr
-    return lines[0]
-
-
 class TestErrors:
-    def test_unknown_preset(self):
+    """One line on stderr that starts with 'error:', exit code 2, no traceback."""
+
+    @pytest.fixture
+    def fails(self, capsys):
+        def run(*args):
+            assert train.main([str(a) for a in args]) == 2
+            lines = capsys.readouterr().err.strip().splitlines()
+            assert len(lines) == 1 and lines[0].startswith("error: "), lines
+            return lines[0]
+
+        return run
+
+    def test_in_a_process_of_its_own(self):
+        done = cli("--preset", "lapto", check=False)
+        assert done.returncode == 2 and done.stdout == ""
+        assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1
+
+    def test_unknown_preset(self, fails):
         assert "did you mean 'laptop'" in fails("--preset", "lapto")
 
-    def test_unknown_ablation(self):
+    def test_unknown_ablation(self, fails):
         assert "arms" in fails("--preset", "debug", "--without", "armz")
 
-    def test_bad_value_names_the_field(self):
+    def test_bad_value_names_the_field(self, fails):
         assert "env.num_envs" in fails(*DEBUG, "--env.num-envs", "0")
         assert "minibatches" in fails(*DEBUG, "--ppo.minibatches", "7")
 
-    def test_folder_with_a_training(self, whole):
+    def test_folder_with_a_training(self, whole, fails):
         before = (whole[0] / "metrics.jsonl").read_bytes()
         assert "--resume" in fails(*DEBUG, "--run-dir", whole[0])
         assert (whole[0] / "metrics.jsonl").read_bytes() == before
 
-    def test_nothing_to_resume(self, tmp_path):
+    def test_nothing_to_resume(self, tmp_path, fails):
         assert "no training" in fails("--resume", "--run-dir", tmp_path / "none")
         assert "--run-dir" in fails("--resume")
 
-    def test_other_config_on_resume(self, whole):
+    def test_other_config_on_resume(self, whole, fails):
         line = fails("--resume", "--run-dir", whole[0], "--ppo.gamma", "0.9")
         assert "ppo.gamma" in line and "0.994" in line
 
-    def test_damaged_config(self, tmp_path):
+    def test_damaged_config(self, tmp_path, fails):
         (tmp_path / "config.json").write_text("{")
         assert "config.json is damaged" in fails("--resume", "--run-dir", tmp_path)
         (tmp_path / "config.json").write_text('{"schema": 1, "seed": 0}')
         assert "missing field" in fails("--resume", "--run-dir", tmp_path)
 
-    def test_all_checkpoints_gone(self, whole, tmp_path):
+    def test_all_checkpoints_gone(self, whole, tmp_path, fails):
         shutil.copytree(whole[0], tmp_path / "r")
         shutil.rmtree(tmp_path / "r" / "checkpoints")
         assert "no checkpoint" in fails("--resume", "--run-dir", tmp_path / "r", "--steps", "2048")
 
-    def test_folder_in_use(self, whole, tmp_path):
+    def test_folder_in_use(self, whole, tmp_path, fails):
         shutil.copytree(whole[0], tmp_path / "r")
         with runner.locked(tmp_path / "r"):
             assert "in use" in fails("--resume", "--run-dir", tmp_path / "r", "--steps", "2048")
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
-    def test_unwritable_folder(self, tmp_path):
+    def test_unwritable_folder(self, tmp_path, fails):
         tmp_path.chmod(0o500)
         assert "cannot write" in fails(*DEBUG, "--run-dir", tmp_path / "r")
 
-    def test_run_dir_below_a_file(self, tmp_path):
+    def test_run_dir_below_a_file(self, tmp_path, fails):
         (tmp_path / "file").write_text("")
         assert "cannot write" in fails(*DEBUG, "--run-dir", tmp_path / "file" / "r")
 

@@ -1,0 +1,139 @@
+"""How well a policy walks and runs: python -m kslc_jax.evaluate POLICY [--speeds 0.5 1.0 ...]
+
+Sweeps commanded forward speeds x seeds with the deterministic policy, in the engine it was
+trained in, or with --fidelity high in full C MuJoCo: 1 ms, elliptic cones, converged solver,
+self-collision, joint friction. Prints a table with 95 % confidence intervals; --json keeps it.
+
+POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from kslc_jax import runtime
+from kslc_jax.config import ConfigError, HighFidelity
+
+HEADLINE = (
+    ("survival", "survived", "{:.0%}"),
+    ("forward_mean", "mean vx [m/s]", "{:.2f}"),
+    ("forward_mean_ci", "+-", "{:.2f}"),
+    ("forward_std", "vx std", "{:.2f}"),
+    ("lateral_std", "vy std", "{:.2f}"),
+    ("yaw_rate_std", "yaw std", "{:.2f}"),
+    ("stride_frequency", "strides/s", "{:.2f}"),
+    ("flight_share", "flight", "{:.0%}"),
+    ("clearance", "clearance [m]", "{:.3f}"),
+    ("shoulder_hip_correlation", "arm-leg corr", "{:.2f}"),
+    ("stance_difference", "L-R stance", "{:.0%}"),
+    ("within_speed_limits", "in speed limits", "{:.1%}"),
+    ("cost_of_transport", "CoT", "{:.2f}"),
+    ("momentum_yaw_rms", "Lz rms", "{:.2f}"),
+)
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to try."""
+
+    policy: tyro.conf.Positional[Path]
+    """Run folder, checkpoint folder, or name of a shipped policy."""
+    speeds: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+    """Commanded forward speeds [m/s]."""
+    seeds: int = 8
+    """Trials per speed."""
+    seconds: float = 20.0
+    """Length of a trial."""
+    fidelity: Literal["train", "high"] = "train"
+    """train: the training engine. high: full C MuJoCo at 1 ms."""
+    noise: bool = False
+    """Sensor noise, action delay and action noise as in training."""
+    seed: int = 0
+    """Of initial states."""
+    json: Path | None = None
+    """Where to keep the numbers."""
+
+    def __post_init__(self):
+        for name in ("seeds", "seconds"):
+            if getattr(self, name) <= 0:
+                raise ConfigError(f"{name} must be positive")
+        if not self.speeds:
+            raise ConfigError("speeds: name at least one")
+
+
+def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, float]]:
+    """One row of metrics per commanded speed, with `forward_mean_ci` over seeds."""
+    import jax
+    import numpy as np
+
+    from kslc_jax import gait_metrics, physics, trials
+
+    engine = HighFidelity() if args.fidelity == "high" else policy.config.physics
+    setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
+    velocities = np.zeros((len(args.speeds) * args.seeds, 3))
+    velocities[:, 0] = np.repeat(args.speeds, args.seeds)
+    pieces = []
+    for piece in trials.run(policy, setting, velocities, args.seed):
+        pieces.append(piece)
+        progress(len(pieces) / round(args.seconds))
+    trace = trials.join(pieces)
+    robot, dt = physics.robot_for(engine), engine.control_dt
+    rows = []
+    for i, speed in enumerate(args.speeds):
+        mine = slice(i * args.seeds, (i + 1) * args.seeds)
+        part = jax.tree.map(lambda x, mine=mine: x[:, mine], trace)
+        rows.append({"command": speed} | gait_metrics.summary(part, speed, robot, dt))
+    return rows
+
+
+def table(rows: list[dict[str, float]], title: str):
+    """The headline numbers as a rich table."""
+    from rich.table import Table
+
+    out = Table(title=title, title_justify="left")
+    out.add_column("command [m/s]", justify="right")
+    for _, label, _ in HEADLINE:
+        out.add_column(label, justify="right")
+    for row in rows:
+        cells = [form.format(row[name]) if name in row else "-" for name, _, form in HEADLINE]
+        out.add_row(f"{row['command']:.1f}", *cells)
+    return out
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    runtime.prepare()
+    try:
+        args = tyro.cli(Args, args=argv, description=__doc__)
+        from rich.console import Console
+        from rich.progress import Progress
+
+        from kslc_jax.checkpoint import CheckpointError, load_policy
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        policy = load_policy(args.policy)
+    except (CheckpointError, ConfigError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    console = Console(highlight=False)
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("trying", total=1.0)
+        rows = sweep(args, policy, lambda share: bar.update(task, completed=share))
+    title = f"{args.policy}, train step {policy.step}, {args.fidelity} fidelity"
+    console.print(table(rows, title))
+    if args.json is not None:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        record = {"policy": str(args.policy), "step": policy.step, "fidelity": args.fidelity}
+        record |= {"seeds": args.seeds, "seconds": args.seconds, "rows": rows}
+        args.json.write_text(json.dumps(record, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
