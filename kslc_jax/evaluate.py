@@ -129,9 +129,9 @@ def main(argv: list[str] | None = None) -> int:
     console.print(table(rows, title))
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
-        record = {"policy": str(args.policy), "step": policy.step, "fidelity": args.fidelity}
-        record |= {"seeds": args.seeds, "seconds": args.seconds, "rows": rows}
-        args.json.write_text(json.dumps(record, indent=1))
+        what = {"policy": str(args.policy), "step": policy.step, "fidelity": args.fidelity}
+        how = {"seeds": args.seeds, "seconds": args.seconds}
+        args.json.write_text(json.dumps({**what, **how, "rows": rows}, indent=1))
     return 0
 
 

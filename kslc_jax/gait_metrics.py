@@ -98,7 +98,7 @@ def strides(trace: Trace, dt: float) -> dict[str, float]:
 def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     """Joint ranges of the two sides, and arms against legs."""
     s = _steady(trace, dt)
-    q = s.qpos[..., 7:]
+    q = np.asarray(s.qpos)[..., 7:]
     names = list(robot.joint_names)
     low, high = np.percentile(q, [5, 95], axis=0).mean(1)
     span = dict(zip(names, high - low, strict=True))

@@ -1,24 +1,11 @@
-"""Every number that a user may change, as frozen, checked dataclasses, and the named presets.
-
-Imports no JAX: a config can be read, checked and printed before anything heavy starts. One value
-lives in one place; what follows from it is a property. `rewards.weights` holds one field per reward
-term of `kslc_jax.rewards.TERMS`.
-
-Sources: "paper" is Zhang et al., KSLC (Tables I and II, Eq. 2 to 10); "HG" is Humanoid-Gym, which
-the paper builds on and which settles what the paper leaves open. Each departure is explained in
-docs/fidelity.md.
-"""
+"""The config's schema: frozen dataclasses with checks; what follows from a value is a property."""
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import json
-import typing
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
-SCHEMA_VERSION = 1
 NUM_JOINTS = 16
 
 Range = tuple[float, float]
@@ -28,13 +15,13 @@ class ConfigError(ValueError):
     """A config value that cannot work; the message names the field and the fix."""
 
 
-def _check(ok: bool, message: str) -> None:
+def require(ok: bool, message: str) -> None:
     if not ok:
         raise ConfigError(message)
 
 
 def _check_range(name: str, value: Range) -> None:
-    _check(value[0] <= value[1], f"{name}: lower bound {value[0]} is above upper bound {value[1]}")
+    require(value[0] <= value[1], f"{name}: lower bound {value[0]} is above upper bound {value[1]}")
 
 
 @dataclass(frozen=True)
@@ -58,11 +45,11 @@ class PhysicsConfig:
     """CPU threads of the mujoco engine; 0 takes all cores. Does not change results."""
 
     def __post_init__(self):
-        _check(self.timestep > 0, "physics.timestep must be positive")
-        _check(self.decimation >= 1, "physics.decimation must be at least 1")
-        _check(self.iterations >= 1, "physics.iterations must be at least 1")
-        _check(self.ls_iterations >= 1, "physics.ls_iterations must be at least 1")
-        _check(self.threads >= 0, "physics.threads must be 0 (all cores) or more")
+        require(self.timestep > 0, "physics.timestep must be positive")
+        require(self.decimation >= 1, "physics.decimation must be at least 1")
+        require(self.iterations >= 1, "physics.iterations must be at least 1")
+        require(self.ls_iterations >= 1, "physics.ls_iterations must be at least 1")
+        require(self.threads >= 0, "physics.threads must be 0 (all cores) or more")
 
     @property
     def control_dt(self) -> float:
@@ -84,7 +71,7 @@ class HighFidelity(PhysicsConfig):
 
     def __post_init__(self):
         super().__post_init__()
-        _check(self.engine == "mujoco", "high fidelity needs physics.engine mujoco")
+        require(self.engine == "mujoco", "high fidelity needs physics.engine mujoco")
 
 
 @dataclass(frozen=True)
@@ -113,11 +100,11 @@ class EnvConfig:
     """Initial joint angles are default + U(-x, x) [rad] (HG)."""
 
     def __post_init__(self):
-        _check(self.num_envs >= 1, "env.num_envs must be at least 1")
-        _check(self.episode_seconds > 0, "env.episode_seconds must be positive")
-        _check(self.frames >= 1, "env.frames must be at least 1")
-        _check(self.privileged_frames >= 1, "env.privileged_frames must be at least 1")
-        _check(0 <= self.action_delay <= 1, "env.action_delay must lie in [0, 1]")
+        require(self.num_envs >= 1, "env.num_envs must be at least 1")
+        require(self.episode_seconds > 0, "env.episode_seconds must be positive")
+        require(self.frames >= 1, "env.frames must be at least 1")
+        require(self.privileged_frames >= 1, "env.privileged_frames must be at least 1")
+        require(0 <= self.action_delay <= 1, "env.action_delay must lie in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -143,8 +130,8 @@ class CommandConfig:
     def __post_init__(self):
         _check_range("command.vy", self.vy)
         _check_range("command.heading", self.heading)
-        _check(self.resample_seconds > 0, "command.resample_seconds must be positive")
-        _check(
+        require(self.resample_seconds > 0, "command.resample_seconds must be positive")
+        require(
             0 <= self.stand_fraction + self.forward_fraction <= 1,
             "command.stand_fraction + command.forward_fraction must lie in [0, 1]",
         )
@@ -174,9 +161,9 @@ class GaitConfig:
     """Episodes start at a random gait phase (HG: phase 0)."""
 
     def __post_init__(self):
-        _check(self.cycle_time > 0, "gait.cycle_time must be positive")
-        _check(0 <= self.double_support < 1, "gait.double_support must lie in [0, 1)")
-        _check(self.full_speed > 0, "gait.full_speed must be positive")
+        require(self.cycle_time > 0, "gait.cycle_time must be positive")
+        require(0 <= self.double_support < 1, "gait.double_support must lie in [0, 1)")
+        require(self.full_speed > 0, "gait.full_speed must be positive")
 
 
 @dataclass(frozen=True)
@@ -214,7 +201,7 @@ class RandomizeConfig:
             if isinstance(value, tuple):
                 _check_range(f"randomize.{f.name}", value)
         for name in ("kp", "kd", "motor_strength", "friction"):
-            _check(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
+            require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
 
 
 @dataclass(frozen=True)
@@ -295,9 +282,9 @@ class RewardConfig:
     """Share of the joint speed limit above which dof_vel_limits counts."""
 
     def __post_init__(self):
-        _check(self.momentum_scale > 0, "rewards.momentum_scale must be positive")
-        _check(self.momentum_floor < 0, "rewards.momentum_floor must be negative")
-        _check(self.clearance_width > 0, "rewards.clearance_width must be positive")
+        require(self.momentum_scale > 0, "rewards.momentum_scale must be positive")
+        require(self.momentum_floor < 0, "rewards.momentum_floor must be negative")
+        require(self.clearance_width > 0, "rewards.clearance_width must be positive")
 
 
 @dataclass(frozen=True)
@@ -326,13 +313,13 @@ class CurriculumConfig:
     """Updates between two changes."""
 
     def __post_init__(self):
-        _check(0 < self.cycle_factor <= 1, "curriculum.cycle_factor must lie in (0, 1]")
-        _check(self.v_step > 0, "curriculum.v_step must be positive")
-        _check(
+        require(0 < self.cycle_factor <= 1, "curriculum.cycle_factor must lie in (0, 1]")
+        require(self.v_step > 0, "curriculum.v_step must be positive")
+        require(
             self.v_min <= self.v_start <= self.v_limit,
             "curriculum needs v_min <= v_start <= v_limit",
         )
-        _check(0 <= self.smoothing < 1, "curriculum.smoothing must lie in [0, 1)")
+        require(0 <= self.smoothing < 1, "curriculum.smoothing must lie in [0, 1)")
 
 
 @dataclass(frozen=True)
@@ -346,8 +333,8 @@ class NetworkConfig:
     """Actor equivariant under left-right mirroring by construction."""
 
     def __post_init__(self):
-        _check(all(n > 0 for n in self.actor + self.critic), "network sizes must be positive")
-        _check(self.init_std > 0, "network.init_std must be positive")
+        require(all(n > 0 for n in self.actor + self.critic), "network sizes must be positive")
+        require(self.init_std > 0, "network.init_std must be positive")
 
 
 @dataclass(frozen=True)
@@ -371,9 +358,9 @@ class PPOConfig:
 
     def __post_init__(self):
         for name in ("rollout_steps", "minibatches", "epochs"):
-            _check(getattr(self, name) >= 1, f"ppo.{name} must be at least 1")
-        _check(0 <= self.gamma <= 1, "ppo.gamma must lie in [0, 1]")
-        _check(0 <= self.lam <= 1, "ppo.lam must lie in [0, 1]")
+            require(getattr(self, name) >= 1, f"ppo.{name} must be at least 1")
+        require(0 <= self.gamma <= 1, "ppo.gamma must lie in [0, 1]")
+        require(0 <= self.lam <= 1, "ppo.lam must lie in [0, 1]")
         _check_range("ppo.learning_rate_bounds", self.learning_rate_bounds)
 
 
@@ -390,10 +377,10 @@ class RunConfig:
     """Latest checkpoints kept, beside the best one."""
 
     def __post_init__(self):
-        _check(self.steps >= 1, "run.steps must be at least 1")
-        _check(self.log_every >= 1, "run.log_every must be at least 1")
-        _check(self.checkpoint_minutes > 0, "run.checkpoint_minutes must be positive")
-        _check(self.keep >= 1, "run.keep must be at least 1")
+        require(self.steps >= 1, "run.steps must be at least 1")
+        require(self.log_every >= 1, "run.log_every must be at least 1")
+        require(self.checkpoint_minutes > 0, "run.checkpoint_minutes must be positive")
+        require(self.keep >= 1, "run.keep must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -413,8 +400,8 @@ class Config:
     run: RunConfig = field(default=RunConfig(), compare=False)
 
     def __post_init__(self):
-        _check(self.seed >= 0, "seed must not be negative")
-        _check(
+        require(self.seed >= 0, "seed must not be negative")
+        require(
             self.batch_size % self.ppo.minibatches == 0,
             f"ppo.minibatches: {self.ppo.minibatches} does not divide the batch of "
             f"{self.env.num_envs} envs x {self.ppo.rollout_steps} steps",
@@ -444,166 +431,3 @@ class Config:
     def num_updates(self) -> int:
         """Train steps of a whole run."""
         return -(-self.run.steps // self.batch_size)
-
-
-# --------------------------------------------------------------------------------------- presets
-
-
-def _override(config: Any, **changes: Any) -> Any:
-    """`dataclasses.replace`, where a dict value replaces fields of a nested config."""
-    new = {
-        name: _override(getattr(config, name), **value) if isinstance(value, dict) else value
-        for name, value in changes.items()
-    }
-    return dataclasses.replace(config, **new)
-
-
-_PAPER = Config()
-
-# Humanoid-Gym as the paper compares against: fixed rewards, arms held, no KSLC terms, fixed cycle,
-# commands up to the paper's top speed from the start.
-_BASELINE = _override(
-    _PAPER,
-    env={"arms": "held"},
-    rewards={"velocity_rewards": False, "weights": {"angular_momentum": 0.0}},
-    curriculum={"velocity": False, "cycle": False, "v_start": 3.5},
-)
-
-# Learns fast on two CPU cores. What it changes and why: docs/fidelity.md, "The laptop preset".
-_LAPTOP_LEARNER: dict[str, Any] = {
-    "env": {"num_envs": 2048, "frames": 5},
-    "network": {"actor": (256, 128, 64), "critic": (256, 128, 64), "init_std": 0.6},
-    "ppo": {
-        "rollout_steps": 24,
-        "minibatches": 4,
-        "epochs": 5,
-        "entropy_coef": 0.003,
-        "learning_rate": 1e-3,
-        "learning_rate_bounds": (1e-5, 1e-3),
-    },
-    "run": {"steps": 40_000_000},
-}
-
-_LAPTOP = _override(
-    _override(_PAPER, **_LAPTOP_LEARNER),
-    network={"symmetric": True},
-    command={
-        "stand_fraction": 0.1,
-        "forward_fraction": 0.2,
-        "narrow_speed": 4.0,
-        "stand_still": True,
-    },
-    gait={
-        "reference_speed_gain": 1.0,
-        "arm_swing": 0.5,
-        "elbow_bend": 1.0,
-        "cycle_follows_speed": True,
-        "random_phase": True,
-    },
-    rewards={
-        "base_height_kernel": 30.0,
-        "clearance_width": 0.03,
-        "max_contact_force": 1400.0,
-        "lateral_distance": True,
-        "lean_per_speed": 0.03,
-        "weights": {
-            "tracking_lin_vel": 1.6,
-            "track_vel_hard": 0.8,
-            "dof_vel_limits": -0.5,
-            "stand_still": -0.3,
-        },
-    },
-)
-
-_DEBUG = _override(
-    _LAPTOP,
-    env={"num_envs": 16, "frames": 3},
-    network={"actor": (32, 16), "critic": (32, 16)},
-    ppo={"rollout_steps": 8, "minibatches": 2, "epochs": 2},
-    run={"steps": 1024, "checkpoint_minutes": 0.05},
-)
-
-PRESETS: dict[str, Config] = {
-    "paper": _PAPER,
-    "laptop": _LAPTOP,
-    "debug": _DEBUG,
-    "baseline": _BASELINE,
-    "baseline-laptop": _override(_BASELINE, **_LAPTOP_LEARNER),
-}
-
-# The paper's ablations: one switch each, on any preset.
-ABLATIONS: dict[str, dict[str, Any]] = {
-    "arms": {"env": {"arms": "held"}},
-    "angular-momentum": {"rewards": {"weights": {"angular_momentum": 0.0}}},
-    "velocity-rewards": {"rewards": {"velocity_rewards": False}},
-    "velocity-curriculum": {"curriculum": {"velocity": False, "v_start": 3.5}},
-    "cycle-curriculum": {"curriculum": {"cycle": False}},
-}
-
-
-def _lookup(kind: str, name: str, table: dict[str, Any]) -> Any:
-    if name in table:
-        return table[name]
-    close = difflib.get_close_matches(name, table, n=1)
-    hint = f", did you mean {close[0]!r}?" if close else ""
-    raise ConfigError(f"unknown {kind} {name!r}{hint} (known: {', '.join(table)})")
-
-
-def preset(name: str, without: tuple[str, ...] = ()) -> Config:
-    """The named preset with the ablations in `without` applied; ConfigError on unknown names."""
-    config = _lookup("preset", name, PRESETS)
-    for part in without:
-        config = _override(config, **_lookup("ablation", part, ABLATIONS))
-    return config
-
-
-# ---------------------------------------------------------------------------------------- storage
-
-
-def to_dict(config: Config) -> dict[str, Any]:
-    """Plain nested dict for JSON, with the schema version."""
-    return {"schema": SCHEMA_VERSION, **dataclasses.asdict(config)}
-
-
-def from_dict(data: dict[str, Any]) -> Config:
-    """Inverse of `to_dict`; ConfigError names a missing, unknown or mistyped field."""
-    _check(isinstance(data, dict), "config: not a JSON object")
-    data = dict(data)
-    schema = data.pop("schema", None)
-    _check(
-        schema == SCHEMA_VERSION,
-        f"config: schema version {schema}, this kslc_jax reads version {SCHEMA_VERSION}",
-    )
-    return _build(Config, data, "config")
-
-
-def _build(cls: type, data: Any, where: str) -> Any:
-    _check(isinstance(data, dict), f"{where}: expected an object, got {type(data).__name__}")
-    resolved = typing.get_type_hints(cls)
-    hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
-    unknown = set(data) - set(hints)
-    _check(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
-    missing = set(hints) - set(data)
-    _check(not missing, f"{where}: missing field {', '.join(sorted(missing))}")
-    return cls(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in hints})
-
-
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """One field's value, checked against its annotation."""
-    wrong = f"{where}: {json.dumps(value, default=str)} is not a valid value"
-    origin = typing.get_origin(hint)
-    if dataclasses.is_dataclass(hint):
-        return _build(typing.cast(type, hint), value, where)
-    if origin is Literal:
-        _check(value in typing.get_args(hint), wrong)
-        return value
-    if origin is tuple:
-        _check(isinstance(value, list | tuple), wrong)
-        args = typing.get_args(hint)
-        _check(args[-1] is Ellipsis or len(value) == len(args), wrong)
-        return tuple(_value(args[0], v, where) for v in value)
-    if hint is float:
-        _check(isinstance(value, int | float) and not isinstance(value, bool), wrong)
-        return float(value)
-    _check(isinstance(value, hint) and (hint is bool or not isinstance(value, bool)), wrong)
-    return value

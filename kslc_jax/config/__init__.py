@@ -1,0 +1,55 @@
+"""Every number that a user may change, as frozen, checked dataclasses, and the named presets.
+
+Imports no JAX: a config can be read, checked and printed before anything heavy starts. One value
+lives in one place. `rewards.weights` holds one field per reward term of `kslc_jax.rewards.TERMS`.
+
+Sources: "paper" is Zhang et al., KSLC (Tables I and II, Eq. 2 to 10); "HG" is Humanoid-Gym, which
+the paper builds on and which settles what the paper leaves open. Each departure is explained in
+docs/fidelity.md.
+"""
+
+from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
+from kslc_jax.config.schema import (
+    NUM_JOINTS,
+    CommandConfig,
+    Config,
+    ConfigError,
+    CurriculumConfig,
+    EnvConfig,
+    GaitConfig,
+    HighFidelity,
+    NetworkConfig,
+    PhysicsConfig,
+    PPOConfig,
+    RandomizeConfig,
+    Range,
+    RewardConfig,
+    RewardWeights,
+    RunConfig,
+)
+from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
+
+__all__ = [
+    "ABLATIONS",
+    "NUM_JOINTS",
+    "PRESETS",
+    "SCHEMA_VERSION",
+    "CommandConfig",
+    "Config",
+    "ConfigError",
+    "CurriculumConfig",
+    "EnvConfig",
+    "GaitConfig",
+    "HighFidelity",
+    "NetworkConfig",
+    "PPOConfig",
+    "PhysicsConfig",
+    "RandomizeConfig",
+    "Range",
+    "RewardConfig",
+    "RewardWeights",
+    "RunConfig",
+    "from_dict",
+    "preset",
+    "to_dict",
+]

@@ -1,0 +1,115 @@
+"""Named configs, and the paper's ablations as changes to any of them."""
+
+import dataclasses
+import difflib
+from typing import Any
+
+from kslc_jax.config.schema import Config, ConfigError
+
+
+def _override(config: Any, **changes: Any) -> Any:
+    """`dataclasses.replace`, where a dict value replaces fields of a nested config."""
+    new = {
+        name: _override(getattr(config, name), **value) if isinstance(value, dict) else value
+        for name, value in changes.items()
+    }
+    return dataclasses.replace(config, **new)
+
+
+_PAPER = Config()
+
+# Humanoid-Gym as the paper compares against: fixed rewards, arms held, no KSLC terms, fixed cycle,
+# commands up to the paper's top speed from the start.
+_BASELINE = _override(
+    _PAPER,
+    env={"arms": "held"},
+    rewards={"velocity_rewards": False, "weights": {"angular_momentum": 0.0}},
+    curriculum={"velocity": False, "cycle": False, "v_start": 3.5},
+)
+
+# Learns fast on two CPU cores. What it changes and why: docs/fidelity.md, "The laptop preset".
+_LAPTOP_LEARNER: dict[str, Any] = {
+    "env": {"num_envs": 2048, "frames": 5},
+    "network": {"actor": (256, 128, 64), "critic": (256, 128, 64), "init_std": 0.6},
+    "ppo": {
+        "rollout_steps": 24,
+        "minibatches": 4,
+        "epochs": 5,
+        "entropy_coef": 0.003,
+        "learning_rate": 1e-3,
+        "learning_rate_bounds": (1e-5, 1e-3),
+    },
+    "run": {"steps": 40_000_000},
+}
+
+_LAPTOP = _override(
+    _override(_PAPER, **_LAPTOP_LEARNER),
+    network={"symmetric": True},
+    command={
+        "stand_fraction": 0.1,
+        "forward_fraction": 0.2,
+        "narrow_speed": 4.0,
+        "stand_still": True,
+    },
+    gait={
+        "reference_speed_gain": 1.0,
+        "arm_swing": 0.5,
+        "elbow_bend": 1.0,
+        "cycle_follows_speed": True,
+        "random_phase": True,
+    },
+    rewards={
+        "base_height_kernel": 30.0,
+        "clearance_width": 0.03,
+        "max_contact_force": 1400.0,
+        "lateral_distance": True,
+        "lean_per_speed": 0.03,
+        "weights": {
+            "tracking_lin_vel": 1.6,
+            "track_vel_hard": 0.8,
+            "dof_vel_limits": -0.5,
+            "stand_still": -0.3,
+        },
+    },
+)
+
+_DEBUG = _override(
+    _LAPTOP,
+    env={"num_envs": 16, "frames": 3},
+    network={"actor": (32, 16), "critic": (32, 16)},
+    ppo={"rollout_steps": 8, "minibatches": 2, "epochs": 2},
+    run={"steps": 1024, "checkpoint_minutes": 0.05},
+)
+
+PRESETS: dict[str, Config] = {
+    "paper": _PAPER,
+    "laptop": _LAPTOP,
+    "debug": _DEBUG,
+    "baseline": _BASELINE,
+    "baseline-laptop": _override(_BASELINE, **_LAPTOP_LEARNER),
+}
+
+# The paper's ablations: one switch each, on any preset.
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "arms": {"env": {"arms": "held"}},
+    "angular-momentum": {"rewards": {"weights": {"angular_momentum": 0.0}}},
+    "velocity-rewards": {"rewards": {"velocity_rewards": False}},
+    "velocity-curriculum": {"curriculum": {"velocity": False, "v_start": 3.5}},
+    "cycle-curriculum": {"curriculum": {"cycle": False}},
+}
+
+
+def _lookup(kind: str, name: str, table: dict[str, Any]) -> Any:
+    if name in table:
+        return table[name]
+    close = difflib.get_close_matches(name, table, n=1)
+    hint = f", did you mean {close[0]!r}?" if close else ""
+    raise ConfigError(f"unknown {kind} {name!r}{hint} (known: {', '.join(table)})")
+
+
+def preset(name: str, without: tuple[str, ...] = ()) -> Config:
+    """The named preset with the ablations in `without` applied; ConfigError on unknown names."""
+    config = _lookup("preset", name, PRESETS)
+    for part in without:
+        config = _override(config, **_lookup("ablation", part, ABLATIONS))
+    return config

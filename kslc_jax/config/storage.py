@@ -1,0 +1,59 @@
+"""Configs as JSON: plain dicts with a schema version, read back strictly."""
+
+import dataclasses
+import json
+import typing
+from typing import Any, Literal
+
+from kslc_jax.config.schema import Config, require
+
+SCHEMA_VERSION = 1
+
+
+def to_dict(config: Config) -> dict[str, Any]:
+    """Plain nested dict for JSON, with the schema version."""
+    return {"schema": SCHEMA_VERSION, **dataclasses.asdict(config)}
+
+
+def from_dict(data: dict[str, Any]) -> Config:
+    """Inverse of `to_dict`; ConfigError names a missing, unknown or mistyped field."""
+    require(isinstance(data, dict), "config: not a JSON object")
+    data = dict(data)
+    schema = data.pop("schema", None)
+    require(
+        schema == SCHEMA_VERSION,
+        f"config: schema version {schema}, this kslc_jax reads version {SCHEMA_VERSION}",
+    )
+    return _build(Config, data, "config")
+
+
+def _build(cls: Any, data: Any, where: str) -> Any:
+    require(isinstance(data, dict), f"{where}: expected an object, got {type(data).__name__}")
+    resolved = typing.get_type_hints(cls)
+    hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
+    unknown = set(data) - set(hints)
+    require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
+    missing = set(hints) - set(data)
+    require(not missing, f"{where}: missing field {', '.join(sorted(missing))}")
+    return cls(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in hints})
+
+
+def _value(hint: Any, value: Any, where: str) -> Any:
+    """One field's value, checked against its annotation."""
+    wrong = f"{where}: {json.dumps(value, default=str)} is not a valid value"
+    origin = typing.get_origin(hint)
+    if dataclasses.is_dataclass(hint):
+        return _build(hint, value, where)
+    if origin is Literal:
+        require(value in typing.get_args(hint), wrong)
+        return value
+    if origin is tuple:
+        require(isinstance(value, list | tuple), wrong)
+        args = typing.get_args(hint)
+        require(args[-1] is Ellipsis or len(value) == len(args), wrong)
+        return tuple(_value(args[0], v, where) for v in value)
+    if hint is float:
+        require(isinstance(value, int | float) and not isinstance(value, bool), wrong)
+        return float(value)
+    require(isinstance(value, hint) and (hint is bool or not isinstance(value, bool)), wrong)
+    return value
