@@ -1,0 +1,127 @@
+"""Trials of a policy under fixed commands, and the numbers drawn from them."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from kslc_jax import checkpoint, curriculum, evaluate, gait_metrics, networks, trials
+from kslc_jax.config import HighFidelity, PhysicsConfig, preset
+
+DT = 0.01
+
+
+@pytest.fixture(scope="module")
+def still():
+    """A policy that asks for the default pose whatever it sees."""
+    config = preset("debug")
+    params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
+    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+
+
+@pytest.mark.parametrize("physics", [PhysicsConfig(engine="mujoco"), HighFidelity()])
+def test_servos_alone_stand_a_second_and_then_fall(still, physics):
+    """Bare servos fall after about two seconds at either fidelity; what fell stays fallen."""
+    setting = trials.Setting(physics, seconds=5.0)
+    trace = trials.join(list(trials.run(still, setting, np.zeros((3, 3)))))
+    assert trace.alive.shape == (500, 3) and trace.qpos.shape == (500, 3, 23)
+    assert trace.alive[:80].all() and not trace.alive[-1].any()
+    assert not np.any(np.diff(trace.alive.astype(int), axis=0) > 0)
+    weight = (trace.contact[30:80]).mean()
+    assert weight > 0.9
+
+
+def test_commands_hold(still):
+    """The commanded velocity reaches the frames and stays; a yaw rate keeps the heading ahead."""
+    setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=1.0)
+    config = trials.trial_config(still.config, setting, 2)
+    assert config.command.resample_seconds >= 10.0 and config.env.noise_level == 0.0
+    assert config.randomize.push_seconds == 0.0
+
+
+def synthetic(seconds=12.0, frequency=1.25, speed=2.0):
+    """Two robots with perfect alternating steps: duty 40 %, so 20 % of the time in flight."""
+    t = np.arange(0, seconds, DT)
+    n, steps = 2, len(t)
+    phase = (t * frequency) % 1.0
+    left, right = phase < 0.4, (phase + 0.5) % 1.0 < 0.4
+    contact = np.stack([left, right], -1)[:, None].repeat(n, 1)
+    q = np.zeros((steps, n, 23))
+    swing = np.sin(2 * np.pi * frequency * t)[:, None]
+    q[..., 7 + 2], q[..., 7 + 8] = 0.5 * swing, 0.5 * swing  # hips: mirrored axes
+    q[..., 7 + 12], q[..., 7 + 14] = -0.3 * swing, -0.3 * swing  # shoulders against them
+    zeros = np.zeros((steps, n, 3))
+    return trials.Trace(
+        alive=np.ones((steps, n), bool),
+        qpos=q,
+        linvel=zeros + np.array([speed, 0, 0]),
+        angvel=zeros,
+        euler=zeros,
+        joint_vel=np.zeros((steps, n, 16)),
+        torque=np.ones((steps, n, 16)),
+        contact=contact,
+        foot_height=np.where(contact, 0.05, 0.15),
+        angular_momentum=zeros + np.array([0.0, 3.0, 4.0]),
+    )
+
+
+def test_metrics_of_a_known_gait(xbot):
+    m = gait_metrics.summary(synthetic(), 2.0, xbot, DT)
+    assert m["survival"] == 1.0 and m["forward_mean"] == pytest.approx(2.0)
+    assert m["stride_frequency"] == pytest.approx(1.25, rel=0.02)
+    assert m["stride_length"] == pytest.approx(1.6, rel=0.02)
+    assert m["flight_share"] == pytest.approx(0.2, abs=0.02)
+    assert m["clearance"] == pytest.approx(0.1)
+    assert m["stance_difference"] == pytest.approx(0.0, abs=0.02)
+    assert m["shoulder_hip_correlation"] == pytest.approx(-1.0)
+    assert m["shoulder_range"] == pytest.approx(0.6, rel=0.05)
+    assert m["momentum_rms"] == pytest.approx(5.0) and m["momentum_yaw_rms"] == pytest.approx(4.0)
+    assert m["within_speed_limits"] == 1.0 and m["cost_of_transport"] == 0.0
+
+
+def test_a_limp_shows(xbot):
+    trace = synthetic()
+    contact = trace.contact.copy()
+    contact[..., 1] = False
+    limp = trace.replace(contact=contact)
+    assert gait_metrics.summary(limp, 2.0, xbot, DT)["stance_difference"] == pytest.approx(2.0)
+
+
+def test_a_fall_counts_as_zero_speed(xbot):
+    """The paper's rule: one of two fell, so the mean of 2 and 0."""
+    trace = synthetic()
+    alive = trace.alive.copy()
+    alive[500:, 1] = False
+    m = gait_metrics.summary(trace.replace(alive=alive), 2.0, xbot, DT)
+    assert m["survival"] == 0.5 and m["forward_mean"] == pytest.approx(1.0)
+    nobody = gait_metrics.summary(trace.replace(alive=alive & False), 2.0, xbot, DT)
+    assert nobody["survival"] == 0.0 and nobody["forward_mean"] == 0.0
+
+
+def test_sweep_and_table(still):
+    args = evaluate.Args("still", speeds=(0.0, 1.0), seeds=2, seconds=3.0)
+    rows = evaluate.sweep(args, still)
+    assert [r["command"] for r in rows] == [0.0, 1.0]
+    assert all(r["survival"] == 0.0 for r in rows)
+    assert evaluate.table(rows, "t").row_count == 2
+    json.dumps(rows)
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["no-such-policy"], "no run, checkpoint or shipped policy"),
+        (["x", "--seeds", "0"], "seeds must be positive"),
+    ],
+)
+def test_errors_are_one_line(argv, says, capsys):
+    assert evaluate.main(argv) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1 and err[0].startswith("error: ") and says in err[0]
+
+
+def test_speed_as_a_word_exits_with_2():
+    with pytest.raises(SystemExit) as stop:
+        evaluate.main(["x", "--speeds", "fast"])
+    assert stop.value.code == 2
