@@ -41,7 +41,7 @@ def sample(
     forward = kind < config.stand_fraction + config.forward_fraction
     vx = jnp.where(stand, 0.0, vx)
     vy = jnp.where(forward, 0.0, vy)
-    heading = jnp.where(stand, yaw, heading)
+    heading = jnp.where(forward, yaw, heading)
     alive = jnp.hypot(vx, vy) > config.dead_zone
     velocity = jnp.stack([vx, vy, jnp.zeros(())]) * alive
     return steer(config, Command(velocity, heading, alive), yaw)

@@ -124,14 +124,14 @@ def _values(src: Sources) -> dict[str, jax.Array]:
     }
 
 
-def _frame(config: EnvConfig, table: tuple[Component, ...], src: Sources) -> jax.Array:
+def _frame(table: tuple[Component, ...], src: Sources) -> jax.Array:
     values = _values(src)
     return jnp.concatenate([values[c.name] for c in table]) * _row(table, "scale")
 
 
 def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
     """Noisy actor frame [59]; noise is scaled with its component, as in HG."""
-    frame = _frame(config, ACTOR, src)
+    frame = _frame(ACTOR, src)
     scale = config.noise_level * _row(ACTOR, "noise") * _row(ACTOR, "scale")
     frame = frame + scale * jax.random.normal(key, frame.shape)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
@@ -139,7 +139,7 @@ def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
 
 def critic_frame(config: EnvConfig, src: Sources) -> jax.Array:
     """Privileged frame [89], without noise."""
-    frame = _frame(config, CRITIC, src)
+    frame = _frame(CRITIC, src)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 
 

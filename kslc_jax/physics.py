@@ -94,7 +94,7 @@ def servo_control(robot: Robot, torque, q, dq):
     """Control signal that makes the model's position servos give `torque` at (q, dq).
 
     The servo's force is kp (ctrl - q) - kd dq; solved for ctrl. Its kd stays in the integrator's
-    implicit part, without which the 0.011 kg m^2 foot is unstable at 5 ms.
+    implicit part, without which the light foot is unstable at 5 ms.
     """
     return q + (torque + robot.kd * dq) / robot.kp
 

@@ -114,9 +114,6 @@ def test_forward_commands_have_no_side_speed():
     np.testing.assert_allclose(command.velocity, [1.0, 0.0, 0.0], atol=1e-6)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="2026-11-23: commands.sample zeroes vy only; heading is drawn as for others"
-)
 def test_forward_commands_keep_the_heading():
     """config.CommandConfig.forward_fraction: straight ahead, heading as it is."""
     command = draw(1.0, 0.3, 2.0, 1.0, forward_fraction=1.0)

@@ -105,6 +105,8 @@ class EnvConfig:
         require(self.frames >= 1, "env.frames must be at least 1")
         require(self.privileged_frames >= 1, "env.privileged_frames must be at least 1")
         require(0 <= self.action_delay <= 1, "env.action_delay must lie in [0, 1]")
+        for name in ("action_noise", "noise_level", "reset_joint_noise"):
+            require(getattr(self, name) >= 0, f"env.{name} must not be negative")
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ class CommandConfig:
     narrow_speed: float = 0.0
     """Forward speed [m/s] at which vy and heading changes have shrunk to nothing; 0: never."""
     stand_still: bool = False
-    """Zero command stops the gait clock and asks for both feet on the ground (HG marches)."""
+    """A zero command hides the gait clock and asks for both feet on the ground (HG marches)."""
 
     def __post_init__(self):
         _check_range("command.vy", self.vy)
@@ -200,7 +202,8 @@ class RandomizeConfig:
             value = getattr(self, f.name)
             if isinstance(value, tuple):
                 _check_range(f"randomize.{f.name}", value)
-        for name in ("kp", "kd", "motor_strength", "friction"):
+        require(self.base_mass[0] > -20, "randomize.base_mass: the base link has 21 kg to lose")
+        for name in ("kp", "kd", "motor_strength", "friction", "joint_friction"):
             require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
 
 
@@ -285,6 +288,9 @@ class RewardConfig:
         require(self.momentum_scale > 0, "rewards.momentum_scale must be positive")
         require(self.momentum_floor < 0, "rewards.momentum_floor must be negative")
         require(self.clearance_width > 0, "rewards.clearance_width must be positive")
+        require(self.max_contact_force >= 0, "rewards.max_contact_force must not be negative")
+        _check_range("rewards.feet_distance", self.feet_distance)
+        _check_range("rewards.knee_distance", self.knee_distance)
 
 
 @dataclass(frozen=True)
@@ -362,14 +368,16 @@ class PPOConfig:
         require(0 <= self.gamma <= 1, "ppo.gamma must lie in [0, 1]")
         require(0 <= self.lam <= 1, "ppo.lam must lie in [0, 1]")
         _check_range("ppo.learning_rate_bounds", self.learning_rate_bounds)
+        low, high = self.learning_rate_bounds
+        require(low <= self.learning_rate <= high, "ppo.learning_rate must lie within its bounds")
 
 
 @dataclass(frozen=True)
 class RunConfig:
     """The host's side of a training: length, logs, checkpoints; changes no number of it."""
 
-    steps: int = 737_000_000
-    """Environment steps in all (paper's base: 3001 iterations of 4096 x 60)."""
+    steps: int = 737_525_760
+    """Environment steps in all (HG: 3001 iterations of 4096 x 60)."""
     log_every: int = 1
     """Train steps per logged record."""
     checkpoint_minutes: float = 5.0
@@ -401,6 +409,10 @@ class Config:
 
     def __post_init__(self):
         require(self.seed >= 0, "seed must not be negative")
+        require(
+            self.curriculum.cycle_min <= self.gait.cycle_time,
+            "curriculum.cycle_min must not be above gait.cycle_time, where the cycle starts",
+        )
         require(
             self.batch_size % self.ppo.minibatches == 0,
             f"ppo.minibatches: {self.ppo.minibatches} does not divide the batch of "
