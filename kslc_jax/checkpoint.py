@@ -35,6 +35,11 @@ class CheckpointError(RuntimeError):
     """A checkpoint that is missing, damaged or of another config; the message says which."""
 
 
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, cut to what fits a terminal."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
 def _split(state: TrainState) -> dict[str, Any]:
     return {
         "params": state.learner.params,
@@ -124,8 +129,8 @@ class Store:
             try:
                 return self._restore(step, like)
             except (ValueError, OSError, KeyError, TypeError) as error:
-                reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-                warn(f"checkpoint {step} cannot be read ({reason}); trying the one before")
+                why = first_line(error)
+                warn(f"checkpoint {step} cannot be read ({why}); trying the one before")
         raise CheckpointError(f"no readable checkpoint in {self.folder}")
 
     def _restore(self, step: int, like: TrainState) -> TrainState:
@@ -193,8 +198,9 @@ def load_policy(path_or_name: str | Path) -> Policy:
             args = ocp.args.Composite(params=ocp.args.StandardRestore(_abstract(like)))
             params = reader.restore(folder, args=args)["params"]
         except (ValueError, OSError, KeyError, TypeError) as error:
-            reason = (str(error).strip() or type(error).__name__).splitlines()[0][:200]
-            raise CheckpointError(f"{folder} is no readable checkpoint: {reason}") from error
+            raise CheckpointError(
+                f"{folder} is no readable checkpoint: {first_line(error)}"
+            ) from error
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves(params))
     if not finite:
         raise CheckpointError(f"{folder}: the parameters hold NaN or infinity")

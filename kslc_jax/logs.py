@@ -24,9 +24,12 @@ class MetricsFile:
 
     def __init__(self, run_dir: Path, after: int = 0):
         self.path = run_dir / "metrics.jsonl"
+        self.seconds_before = 0.0
+        """Wall time [s] that the kept records have seen."""
         if self.path.exists():
             kept = [line for line in self.path.read_text().splitlines() if _step(line) <= after]
             self.path.write_text("".join(f"{line}\n" for line in kept))
+            self.seconds_before = json.loads(kept[-1]).get("seconds", 0.0) if kept else 0.0
         self._file = self.path.open("a")
         self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=after)
 
@@ -68,7 +71,7 @@ class Progress:
 
     def say(self, message: str) -> None:
         """One line above the progress."""
-        self.console.print(message)
+        self.console.print(message, markup=False)
 
     def show(self, record: dict[str, float]) -> None:
         """Shows one record of metrics."""
@@ -79,7 +82,7 @@ class Progress:
             self._live.update(self._table(record), refresh=True)
         elif time.monotonic() - self._printed > PLAIN_SECONDS:
             self._printed = time.monotonic()
-            self.console.print(self._line(record))
+            self.console.print(self._line(record), markup=False)
 
     def close(self) -> None:
         """Leaves the last table on the screen."""

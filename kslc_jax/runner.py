@@ -21,7 +21,7 @@ import jax
 
 from kslc_jax import config as config_lib
 from kslc_jax import physics, train_step
-from kslc_jax.checkpoint import BEST_METRIC, Store
+from kslc_jax.checkpoint import BEST_METRIC, Store, first_line
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.logs import MetricsFile, Progress
 from kslc_jax.train_step import TrainState
@@ -136,7 +136,7 @@ def train(config: Config, run_dir: Path, resume: bool, progress: Progress) -> Tr
         start = time.monotonic()
         if resume:
             like = jax.eval_shape(init)
-            state = store.restore(like, lambda text: progress.say(f"[yellow]warning:[/] {text}"))
+            state = store.restore(like, lambda text: progress.say(f"warning: {text}"))
             progress.say(f"resumed at train step {int(state.step)}")
         else:
             state = init()
@@ -151,8 +151,9 @@ def train(config: Config, run_dir: Path, resume: bool, progress: Progress) -> Tr
 def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> TrainState:
     """Steps, logs and saves; returns the last state, which is on disk."""
     first = int(state.step)
-    begun = saved = time.monotonic()
     file = MetricsFile(run_dir, after=first)
+    saved = time.monotonic()
+    begun = saved - file.seconds_before
     record: dict[str, float] = {}
     with _Stop() as stop, contextlib.closing(file):
         for step in range(first + 1, config.num_updates + 1):
@@ -177,7 +178,7 @@ def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> 
                 _save(store, state, config, record, progress)
         if record:
             _save(store, state, config, record, progress)
-            store.wait()
+            _settle(store)
     _farewell(config, run_dir, state, stop.requested, progress)
     return state
 
@@ -186,9 +187,17 @@ def _save(store: Store, state: TrainState, config: Config, record, progress: Pro
     """Saves; a failure is said, and training goes on with the checkpoints before."""
     try:
         store.save(state, config, record)
-    except (OSError, ValueError) as error:
-        reason = str(error).splitlines()[0]
-        progress.say(f"[red]could not save a checkpoint:[/] {reason}; training goes on")
+    except Exception as error:  # whatever orbax met: hours of training must not die of it
+        progress.say(f"warning: could not save a checkpoint: {first_line(error)}; training goes on")
+
+
+def _settle(store: Store) -> None:
+    """Waits until the last save is on disk; RunError if it is not."""
+    try:
+        store.wait()
+    except Exception as error:
+        message = f"the last state could not be saved: {first_line(error)}"
+        raise RunError(f"{message}; the checkpoints before it are whole") from error
 
 
 def _farewell(

@@ -37,7 +37,7 @@ class Args:
     """What to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
     run_dir: Path | None = None
-    """Where everything goes; runs/PRESET-seedN if not given."""
+    """Where everything goes; runs/PRESET-seedN if not given, with -no-PART for each ablation."""
     steps: int | None = None
     """Environment steps in all; short for --run.steps."""
     resume: bool = False
@@ -66,16 +66,24 @@ def parse(argv: list[str]) -> Args:
         if name == "auto":
             name = "laptop" if helping else runtime.auto_preset()
         base = config_lib.preset(name, tuple(known.without))
-    args = tyro.cli(
-        Args,
-        args=argv,
-        default=Args(config=base),
-        description=__doc__,
-    )
+    args = tyro.cli(Args, args=argv, default=Args(config=base), description=__doc__)
     config = args.config
     if args.steps is not None:
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=args.steps))
     return dataclasses.replace(args, config=config)
+
+
+def headline(args: Args) -> tuple[str, Path]:
+    """What is about to run, in a few words, and its run folder."""
+    if args.resume and args.run_dir is not None:
+        return "resuming", args.run_dir
+    name, why = args.preset, ""
+    if name == "auto":
+        name = runtime.auto_preset()
+        why = f" (auto: {'an' if name == 'paper' else 'no'} accelerator)"
+    name = "-no-".join([name, *args.without])
+    folder = args.run_dir or Path("runs") / f"{name}-seed{args.config.seed}"
+    return f"preset {name}{why}", folder
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -90,15 +98,17 @@ def main(argv: list[str] | None = None) -> int:
     except (ConfigError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    name = runtime.auto_preset() if args.preset == "auto" else args.preset
-    run_dir = args.run_dir or Path("runs") / f"{name}-seed{args.config.seed}"
+    title, run_dir = headline(args)
     progress = Progress(args.config)
-    progress.say(f"preset {name}: {runner.describe(args.config, run_dir)}")
+    progress.say(f"{title}: {runner.describe(args.config, run_dir)}")
     try:
         runner.train(args.config, run_dir, args.resume, progress)
     except (ConfigError, runner.RunError, CheckpointError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print("interrupted before the state was saved", file=sys.stderr)
+        return 130
     return 0
 
 
