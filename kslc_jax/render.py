@@ -1,0 +1,102 @@
+"""Pictures of recorded motion: gait strips and videos, rendered off screen.
+
+Import this module before anything that imports mujoco: it picks the GL backend, which mujoco reads
+once, when it is first imported.
+"""
+
+import ctypes.util
+import os
+import sys
+
+_BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
+
+
+class RenderError(RuntimeError):
+    """No way to render on this machine; the message says what to install."""
+
+
+def choose_backend() -> None:
+    """Sets MUJOCO_GL to EGL or else OSMesa, unless the user has set it; RenderError if neither."""
+    if os.environ.get("MUJOCO_GL"):
+        return
+    if "mujoco" in sys.modules:
+        raise RenderError("set MUJOCO_GL=egl or osmesa: mujoco was imported before the renderer")
+    for backend, library in _BACKENDS.items():
+        if ctypes.util.find_library(library):
+            os.environ["MUJOCO_GL"] = backend
+            return
+    raise RenderError("no off-screen GL: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6)")
+
+
+choose_backend()
+
+from collections.abc import Iterator, Sequence  # noqa: E402
+
+import mujoco  # noqa: E402
+import numpy as np  # noqa: E402
+
+from kslc_jax import robot as robot_lib  # noqa: E402
+
+LONG_LENS = 10.0
+"""Vertical field of view of gait strips [degrees]."""
+
+
+def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
+    """A camera that looks at a point set by `lookat`."""
+    cam = mujoco.MjvCamera()
+    cam.distance, cam.azimuth, cam.elevation = distance, azimuth, elevation
+    return cam
+
+
+def frames(
+    qpos: np.ndarray, width: int = 640, height: int = 480, distance: float = 3.0
+) -> Iterator[np.ndarray]:
+    """Pictures [height, width, 3] of a trajectory [T, 23], the camera going along at the side."""
+    model = robot_lib.load("high").mj_model
+    data, cam = mujoco.MjData(model), camera(distance)
+    with mujoco.Renderer(model, height, width) as renderer:
+        for q in qpos:
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            cam.lookat[:] = [q[0], q[1], 0.8]
+            renderer.update_scene(data, cam)
+            yield renderer.render()
+
+
+def gait_strip(
+    qpos: np.ndarray, dt: float, interval: float = 0.25, width: int = 1800, height: int = 420
+) -> np.ndarray:
+    """One picture: the robot every `interval` seconds on the floor grid of 1 m (paper's figure)."""
+    model = robot_lib.load("high").mj_model
+    shown = qpos[:: round(interval / dt)]
+    middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
+    cam = camera(0.0, elevation=-6.0)
+    # A long lens far away shows every robot from the same side; its view is as wide as the strip.
+    half_width = np.tan(np.radians(LONG_LENS / 2)) * width / height
+    cam.distance = 0.5 * length / half_width
+    cam.lookat[:] = [middle, shown[:, 1].mean(), 0.85]
+    data = mujoco.MjData(model)
+    fovy, model.vis.global_.fovy = model.vis.global_.fovy, LONG_LENS
+    with mujoco.Renderer(model, height, width, max_geom=20_000) as renderer:
+        for i, q in enumerate(shown):
+            data.qpos[:] = q
+            mujoco.mj_forward(model, data)
+            if i == 0:
+                renderer.update_scene(data, cam)
+                continue
+            mujoco.mjv_addGeoms(
+                model,
+                data,
+                mujoco.MjvOption(),
+                mujoco.MjvPerturb(),
+                mujoco.mjtCatBit.mjCAT_DYNAMIC,
+                renderer.scene,
+            )
+        picture = renderer.render()
+    model.vis.global_.fovy = fovy
+    return picture
+
+
+def stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures of one width above each other."""
+    return np.concatenate(list(pictures))
