@@ -23,7 +23,8 @@ class Curriculum:
 class Progress:
     """What one rollout says about the policy; shares are of the maximal tracking reward."""
 
-    tracking: jax.Array  # [] mean over all samples
+    tracking: jax.Array  # [] mean over the samples whose command has settled
+    tracking_count: jax.Array  # [] number of those
     fast_tracking: jax.Array  # [] mean over the fast commands' samples
     fast_count: jax.Array  # [] number of those samples
     episode_steps: jax.Array  # [] mean length of the episodes that ended
@@ -54,11 +55,11 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
     last change. A widened range starts with an empty average of the fast commands.
     """
 
-    def average(old: jax.Array, new: jax.Array, count: jax.Array | float = 1.0) -> jax.Array:
+    def average(old: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array:
         mixed = config.smoothing * old + (1.0 - config.smoothing) * new
         return jnp.where(count > 0, mixed, old)
 
-    tracking = average(state.tracking, progress.tracking)
+    tracking = average(state.tracking, progress.tracking, progress.tracking_count)
     fast = average(state.fast_tracking, progress.fast_tracking, progress.fast_count)
     steps = average(state.episode_steps, progress.episode_steps, progress.episode_count)
     updates = state.updates + 1

@@ -49,7 +49,8 @@ class Outcome:
     broken: jax.Array  # [] bool: the physics diverged; its sample is not to be learnt from
     terms: dict[str, jax.Array]  # raw reward terms, see rewards.TERMS
     tracking: jax.Array  # [] tracking_lin_vel, share of its maximum
-    fast: jax.Array  # [] bool: the command was in the top part of the range
+    settled: jax.Array  # [] bool: the command has been the same for a while
+    fast: jax.Array  # [] bool: and it was in the top part of the range
     episode_steps: jax.Array  # [] int, length of the episode so far
     speeding: jax.Array  # [] bool: some joint is over its speed limit
 
@@ -131,6 +132,7 @@ def step(
             v_max=curriculum.v_max,
         ),
     )
+    settled = _command_age(config, state.time) >= config.curriculum.settle_seconds
     outcome = Outcome(
         reward=jnp.where(broken, 0.0, reward),
         terminated=terminated,
@@ -138,7 +140,8 @@ def step(
         broken=broken,
         terms=terms,
         tracking=terms["tracking_lin_vel"],
-        fast=curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
+        settled=settled,
+        fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
         episode_steps=time,
         speeding=jnp.any(jnp.abs(now.joint_vel) > robot.speed_limit),
     )
@@ -188,9 +191,14 @@ def _resample(
     now: Signals,
 ) -> Command:
     """A new command every `resample_seconds` of the episode."""
-    period = round(config.command.resample_seconds / config.control_dt)
     fresh = _sample_command(config, key, curriculum, now)
-    return maths.tree_where(time % period == 0, fresh, command)
+    return maths.tree_where(_command_age(config, time) == 0.0, fresh, command)
+
+
+def _command_age(config: Config, time: jax.Array) -> jax.Array:
+    """Seconds since the last command was drawn, at `time` control steps of the episode."""
+    period = round(config.command.resample_seconds / config.control_dt)
+    return (time % period) * config.control_dt
 
 
 def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:

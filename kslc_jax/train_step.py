@@ -175,13 +175,16 @@ def _windows(
 def _progress(out: Outcome) -> Progress:
     """What the rollout says about the policy, for the curriculum."""
     done = out.terminated | out.truncated
-    fast_count, done_count = jnp.sum(out.fast), jnp.sum(done)
+
+    def mean_over(value: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+        count = jnp.sum(mask)
+        return jnp.sum(value * mask) / jnp.maximum(count, 1), count
+
+    tracking, tracking_count = mean_over(out.tracking, out.settled)
+    fast_tracking, fast_count = mean_over(out.tracking, out.fast)
+    episode_steps, episode_count = mean_over(out.episode_steps, done)
     return Progress(
-        tracking=jnp.mean(out.tracking),
-        fast_tracking=jnp.sum(out.tracking * out.fast) / jnp.maximum(fast_count, 1),
-        fast_count=fast_count,
-        episode_steps=jnp.sum(out.episode_steps * done) / jnp.maximum(done_count, 1),
-        episode_count=done_count,
+        tracking, tracking_count, fast_tracking, fast_count, episode_steps, episode_count
     )
 
 

@@ -58,6 +58,7 @@ _LAPTOP = _override(
         "cycle_follows_speed": True,
         "random_phase": True,
     },
+    curriculum={"settle_seconds": 2.0},
     rewards={
         "base_height_kernel": 30.0,
         "clearance_width": 0.03,

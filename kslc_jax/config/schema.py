@@ -313,6 +313,9 @@ class CurriculumConfig:
     fast_threshold: float = 0.7
     """Share of the maximal tracking reward that the fast commands must reach."""
     min_episode_steps: float = 1000.0
+    settle_seconds: float = 0.0
+    """Tracking counts from this long after a change of the command: reaching it takes time, and the
+    longer the wider the range is."""
     smoothing: float = 0.95
     """Moving averages keep this share per update."""
     min_updates: int = 40
