@@ -189,6 +189,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "gait.elbow_bend": 1.0,
         "gait.cycle_follows_speed": True,
         "gait.random_phase": True,
+        "curriculum.settle_seconds": 2.0,
         "rewards.base_height_kernel": 30.0,
         "rewards.clearance_width": 0.03,
         "rewards.max_contact_force": 1400.0,

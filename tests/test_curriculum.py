@@ -22,8 +22,10 @@ def state(**changes) -> Curriculum:
     return start.replace(**{k: jnp.asarray(v, getattr(start, k).dtype) for k, v in changes.items()})
 
 
-def progress(tracking=0.85, fast=0.75, fast_count=10, steps=1500.0, count=5) -> Progress:
-    values = (tracking, fast, fast_count, steps, count)
+def progress(
+    tracking=0.85, fast=0.75, fast_count=10, steps=1500.0, count=5, settled=100
+) -> Progress:
+    values = (tracking, settled, fast, fast_count, steps, count)
     return Progress(*(jnp.asarray(v, jnp.float32) for v in values))
 
 
@@ -57,6 +59,8 @@ def test_averages_skip_what_was_not_seen():
     old = state(tracking=0.5, fast_tracking=0.6, episode_steps=700.0)
     new = curriculum.update(CONFIG, old, progress(0.7, 0.0, 0, 0.0, 0))
     assert float(new.tracking) == pytest.approx(0.51)
+    unsettled = curriculum.update(CONFIG, old, progress(0.0, settled=0))
+    assert float(unsettled.tracking) == pytest.approx(0.5)
     assert float(new.fast_tracking) == pytest.approx(0.6)
     assert float(new.episode_steps) == pytest.approx(700.0)
 

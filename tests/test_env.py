@@ -128,6 +128,15 @@ def test_commands_are_resampled_every_8_seconds(setting):
         assert bool(jnp.any(new.command.velocity[:2] != command)) == changes
 
 
+def test_tracking_settles_two_seconds_after_a_new_command(setting):
+    """Laptop setting: 200 steps after the reset and after each resampling at 800."""
+    _, reset, step = setting
+    state = reset(jax.random.key(3))
+    for time, settled in ((0, False), (199, False), (200, True), (799, True), (800, False)):
+        _, outcome = step(state.replace(time=jnp.asarray(time)), jnp.zeros(16), jax.random.key(4))
+        assert bool(outcome.settled) == settled, time
+
+
 def test_jit_equals_no_jit_and_batch_of_one():
     """float32 fusions reorder sums: 1e-5."""
     config = preset("debug")
