@@ -40,6 +40,9 @@ from kslc_jax import robot as robot_lib  # noqa: E402
 LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
 
+TALL = 2.0
+"""Height that a gait strip shows at least [m]."""
+
 
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
     """A camera that looks at a point set by `lookat`."""
@@ -71,10 +74,10 @@ def gait_strip(
     shown = qpos[:: round(interval / dt)]
     middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
     cam = camera(0.0, elevation=-6.0)
-    # A long lens far away shows every robot from the same side; its view is as wide as the strip.
-    half_width = np.tan(np.radians(LONG_LENS / 2)) * width / height
-    cam.distance = 0.5 * length / half_width
-    cam.lookat[:] = [middle, shown[:, 1].mean(), 0.85]
+    # A long lens far away shows every robot from the same side; all of them have to fit in.
+    half_height = np.tan(np.radians(LONG_LENS / 2))
+    cam.distance = 0.5 * max(length * height / width, TALL) / half_height
+    cam.lookat[:] = [middle, shown[:, 1].mean(), 0.8]
     data = mujoco.MjData(model)
     fovy, model.vis.global_.fovy = model.vis.global_.fovy, LONG_LENS
     with mujoco.Renderer(model, height, width, max_geom=20_000) as renderer:

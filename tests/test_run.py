@@ -1,5 +1,6 @@
 """Run folders as a person meets them: train, stop, resume, load, and what goes wrong."""
 
+import ctypes.util
 import dataclasses
 import json
 import os
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.image
 import numpy as np
 import pytest
 
@@ -154,6 +156,28 @@ def test_load_policy(whole):
     np.testing.assert_array_equal(
         same.act(same.init(), jnp.ones(59))[1], policy.act(policy.init(), jnp.ones(59))[1]
     )
+
+
+def test_gait_strip(whole, tmp_path):
+    """Draws where an off-screen GL is installed; says in one line what to install where not."""
+    out = tmp_path / "strip.png"
+    args = [whole[0], "--speeds", "0.5", "1.0", "--seconds", "0.5", "--gait-strip", out]
+    env = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    done = subprocess.run(
+        [sys.executable, "-m", "kslc_jax.play", *map(str, args)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=env,
+        timeout=300,
+    )
+    if any(ctypes.util.find_library(name) for name in ("EGL", "OSMesa")):
+        assert done.returncode == 0, done.stderr
+        assert "fell at 0.5 m/s" in done.stdout
+        image = matplotlib.image.imread(out)
+        assert image.shape[:2] == (840, 1800) and image[:420].std() > 0.05
+    else:
+        assert done.returncode == 2 and "apt-get install" in done.stderr
 
 
 def damage(folder: Path):
