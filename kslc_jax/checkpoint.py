@@ -22,7 +22,7 @@ import orbax.checkpoint as ocp
 from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import networks, observations
-from kslc_jax.config import Config
+from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.train_step import TrainState
 
@@ -197,7 +197,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
             like = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
             args = ocp.args.Composite(params=ocp.args.StandardRestore(_abstract(like)))
             params = reader.restore(folder, args=args)["params"]
-        except (ValueError, OSError, KeyError, TypeError) as error:
+        except (ConfigError, ValueError, OSError, KeyError, TypeError) as error:
             raise CheckpointError(
                 f"{folder} is no readable checkpoint: {first_line(error)}"
             ) from error

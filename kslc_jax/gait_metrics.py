@@ -13,6 +13,9 @@ GRAVITY = 9.81
 SETTLE = 2.0
 """Seconds at the start that do not count: the robot gathers speed."""
 
+CHATTER = 0.05
+"""Seconds off the ground below which a foot has not left it."""
+
 
 def _steady(trace: Trace, dt: float) -> Trace:
     """The trace after settling, of the trials that did not fall."""
@@ -73,12 +76,18 @@ def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     }
 
 
+def _touchdowns(contact: np.ndarray, dt: float) -> np.ndarray:
+    """Landings [N, 2] of a contact record [T, N, 2]; a foot that chatters lands once."""
+    window = round(CHATTER / dt)
+    padded = np.pad(contact, ((window, 0), (0, 0), (0, 0)))
+    recently = np.any([padded[i : i + len(contact)] for i in range(window)], axis=0)
+    return (contact & ~recently).sum(0)
+
+
 def strides(trace: Trace, dt: float) -> dict[str, float]:
     """Stride frequency and length, flight, clearance, and how alike left and right are."""
     s = _steady(trace, dt)
-    touchdowns = (s.contact[1:] & ~s.contact[:-1]).sum(0)  # [N, 2]
-    seconds = len(s.contact) * dt
-    frequency = float(touchdowns.mean() / seconds)
+    frequency = float(_touchdowns(np.asarray(s.contact), dt).mean() / (len(s.contact) * dt))
     swing_top = [
         float(np.percentile(s.foot_height[..., i], 95) - np.percentile(s.foot_height[..., i], 5))
         for i in (0, 1)

@@ -44,8 +44,8 @@ def synthetic(seconds=12.0, frequency=1.25, speed=2.0):
     """Two robots with perfect alternating steps: duty 40 %, so 20 % of the time in flight."""
     t = np.arange(0, seconds, DT)
     n, steps = 2, len(t)
-    phase = (t * frequency) % 1.0
-    left, right = phase < 0.4, (phase + 0.5) % 1.0 < 0.4
+    cycle = round(1.0 / (frequency * DT))  # in steps, so that rounding favours no side
+    left, right = ((np.arange(steps) + shift) % cycle < 0.4 * cycle for shift in (0, cycle // 2))
     contact = np.stack([left, right], -1)[:, None].repeat(n, 1)
     q = np.zeros((steps, n, 23))
     swing = np.sin(2 * np.pi * frequency * t)[:, None]
@@ -69,8 +69,8 @@ def synthetic(seconds=12.0, frequency=1.25, speed=2.0):
 def test_metrics_of_a_known_gait(xbot):
     m = gait_metrics.summary(synthetic(), 2.0, xbot, DT)
     assert m["survival"] == 1.0 and m["forward_mean"] == pytest.approx(2.0)
-    assert m["stride_frequency"] == pytest.approx(1.25, rel=0.02)
-    assert m["stride_length"] == pytest.approx(1.6, rel=0.02)
+    assert m["stride_frequency"] == pytest.approx(1.25, rel=0.05)  # 12 or 13 landings in 10 s
+    assert m["stride_length"] == pytest.approx(1.6, rel=0.05)
     assert m["flight_share"] == pytest.approx(0.2, abs=0.02)
     assert m["clearance"] == pytest.approx(0.1)
     assert m["stance_difference"] == pytest.approx(0.0, abs=0.02)
@@ -78,6 +78,13 @@ def test_metrics_of_a_known_gait(xbot):
     assert m["shoulder_range"] == pytest.approx(0.6, rel=0.05)
     assert m["momentum_rms"] == pytest.approx(5.0) and m["momentum_yaw_rms"] == pytest.approx(4.0)
     assert m["within_speed_limits"] == 1.0 and m["cost_of_transport"] == 0.0
+
+
+def test_a_chattering_foot_lands_once():
+    """Off 0.1 s, on, off 0.03 s, on, off 0.1 s, on: two landings."""
+    on = np.r_[np.zeros(10), np.ones(10), np.zeros(3), np.ones(5), np.zeros(10), np.ones(5)]
+    contact = np.tile(on.astype(bool)[:, None, None], (1, 1, 2))
+    np.testing.assert_array_equal(gait_metrics._touchdowns(contact, DT), [[2, 2]])
 
 
 def test_a_limp_shows(xbot):

@@ -11,7 +11,7 @@ NUM_JOINTS = 16
 Range = tuple[float, float]
 
 
-class ConfigError(ValueError):
+class ConfigError(Exception):
     """A config value that cannot work; the message names the field and the fix."""
 
 
