@@ -25,7 +25,7 @@ train: $(STAMP) ## Train XBot-L: make train ARGS="--preset laptop --seed 1"
 	@$(BIN)/python -m kslc_jax.train $(ARGS)
 
 test: $(STAMP) ## Quick test suite, a few minutes
-	@$(BIN)/python -m pytest $(ARGS)
+	@$(BIN)/python -m pytest -n 2 --dist loadfile $(ARGS)
 
 test-all: $(STAMP) ## All tests, slow ones too
 	@$(BIN)/python -m pytest -m "" $(ARGS)
