@@ -1,7 +1,7 @@
 """Figures from stored data: python -m kslc_jax.plots RUN... --out curve.png
 
-Each RUN is a run folder or a metrics.jsonl. Draws the learning curve over environment steps:
-commanded-speed range and gait cycle, tracking, episode length, throughput.
+Each RUN is a run folder or a metrics.jsonl. Prints when the commanded-speed range grew, and draws the
+learning curve over environment steps: speed range, tracking, episode length, throughput.
 """
 
 import json
@@ -91,6 +91,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    for run, records in runs.items():
+        print(run)
+        for v, steps, seconds in milestones(records):
+            print(f"  v_max {v:.1f} m/s at {steps / 1e6:5.1f} M steps, {seconds / 60:3.0f} min")
     learning_curve(runs, args.out)
     print(f"wrote {args.out}")
     return 0
