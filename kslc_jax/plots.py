@@ -1,7 +1,7 @@
 """Figures from stored data: python -m kslc_jax.plots RUN... --out curve.png
 
-Each RUN is a run folder or a metrics.jsonl. Prints when the commanded-speed range grew, and draws the
-learning curve over environment steps: speed range, tracking, episode length, throughput.
+Each RUN is a run folder or a metrics.jsonl. Prints when the commanded-speed range grew, and draws
+the learning curve over environment steps: speed range, tracking, episode length, throughput.
 """
 
 import json
