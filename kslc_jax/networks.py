@@ -1,11 +1,13 @@
 """Actor and critic: ELU networks over stacked frames; diagonal Gaussian with a free deviation."""
 
+from dataclasses import dataclass
 from typing import Any, cast
 
 import flax.linen as nn
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from kslc_jax import observations
 from kslc_jax import robot as robot_lib
@@ -15,6 +17,8 @@ Params = dict[str, Any]
 """{'actor': flax params, 'critic': flax params, 'log_std': [16]}"""
 
 _LOG_2PI = 1.8378770664093453
+_HALF = 0.5**0.5
+"""Keeps the variance of a sum or difference of two."""
 
 
 class MLP(nn.Module):
@@ -25,10 +29,61 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, frames: jax.Array) -> jax.Array:
-        x = frames.reshape(*frames.shape[:-2], -1)
+        x = _flat(frames)
         for size in self.hidden:
             x = nn.elu(nn.Dense(size)(x))
         return nn.Dense(self.outputs)(x)
+
+
+@dataclass(frozen=True, eq=False)
+class Parity:
+    """Orthonormal bases of the vectors [W] that a mirror map keeps and of those that it negates."""
+
+    even: np.ndarray  # [W, E]
+    odd: np.ndarray  # [W, W - E]
+
+
+def parity(permutation: np.ndarray, sign: np.ndarray) -> Parity:
+    """Bases for the mirror map v -> v[permutation] * sign, which undoes itself."""
+    eye = np.eye(len(sign), dtype=np.float32)
+    mirror = eye[permutation] * sign[:, None]
+
+    def basis(projected: np.ndarray) -> np.ndarray:
+        # A vector and its mirror image have the same projection but for the sign: keep the first.
+        kept = projected[:, np.arange(len(sign)) <= permutation]
+        norm = np.linalg.norm(kept, axis=0)
+        return kept[:, norm > 0] / norm[norm > 0]
+
+    return Parity(basis(eye + mirror), basis(eye - mirror))
+
+
+class MirrorMLP(nn.Module):
+    """An MLP that commutes with mirroring: f(M x) = M f(x), exactly and for all weights.
+
+    Hidden units come in pairs, one for each side of the robot, which M swaps. A linear map commutes
+    with M if and only if it keeps even parts (M x = x) and odd parts (M x = -x) apart, so each
+    dense layer is two of half the width: half the work of the unconstrained layer.
+    """
+
+    hidden: tuple[int, ...]
+    inputs: Parity
+    outputs: Parity
+
+    @nn.compact
+    def __call__(self, frames: jax.Array) -> jax.Array:
+        even, odd = _flat(frames @ self.inputs.even), _flat(frames @ self.inputs.odd)
+        for size in self.hidden:
+            even, odd = nn.Dense(size // 2)(even), nn.Dense(size // 2, use_bias=False)(odd)
+            left, right = nn.elu((even + odd) * _HALF), nn.elu((even - odd) * _HALF)
+            even, odd = (left + right) * _HALF, (left - right) * _HALF
+        out = nn.Dense(self.outputs.even.shape[1])(even) @ self.outputs.even.T
+        if self.outputs.odd.shape[1]:
+            out += nn.Dense(self.outputs.odd.shape[1], use_bias=False)(odd) @ self.outputs.odd.T
+        return out
+
+
+def _flat(frames: jax.Array) -> jax.Array:
+    return frames.reshape(*frames.shape[:-2], -1)
 
 
 @flax.struct.dataclass
@@ -59,12 +114,18 @@ class Gaussian:
         return jnp.sum(per_joint, axis=-1)
 
 
-def _actor(config: Config) -> MLP:
-    return MLP(config.network.actor, NUM_JOINTS)
+def _actor(config: Config) -> nn.Module:
+    if not config.network.symmetric:
+        return MLP(config.network.actor, NUM_JOINTS)
+    inputs = parity(*observations.mirror_map(observations.ACTOR))
+    return MirrorMLP(config.network.actor, inputs, parity(*robot_lib.mirror_joints()))
 
 
-def _critic(config: Config) -> MLP:
-    return MLP(config.network.critic, 1)
+def _critic(config: Config) -> nn.Module:
+    if not config.network.symmetric:
+        return MLP(config.network.critic, 1)
+    inputs = parity(*observations.mirror_map(observations.CRITIC))
+    return MirrorMLP(config.network.critic, inputs, parity(np.zeros(1, int), np.ones(1)))
 
 
 def init(config: Config, key: jax.Array) -> Params:
@@ -80,21 +141,8 @@ def init(config: Config, key: jax.Array) -> Params:
 
 
 def policy(config: Config, params: Params, history: jax.Array) -> Gaussian:
-    """Action distribution for actor histories [..., K, 59].
-
-    With `network.symmetric`, mean(o) = (f(o) + M f(M o)) / 2 for the mirror map M: a mirrored robot
-    gets the mirrored action, exactly.
-    """
-
-    def f(x: jax.Array) -> jax.Array:
-        return cast(jax.Array, _actor(config).apply({"params": params["actor"]}, x))
-
-    if not config.network.symmetric:
-        return Gaussian(f(history), log_std(config, params))
-    frame_permutation, frame_sign = observations.mirror_map(observations.ACTOR)
-    joints, sign = robot_lib.mirror_joints()
-    both = f(jnp.stack([history, history[..., frame_permutation] * frame_sign]))
-    mean = 0.5 * (both[0] + both[1][..., joints] * sign)
+    """Action distribution for actor histories [..., K, 59]."""
+    mean = cast(jax.Array, _actor(config).apply({"params": params["actor"]}, history))
     return Gaussian(mean, log_std(config, params))
 
 

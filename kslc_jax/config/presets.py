@@ -39,7 +39,7 @@ _LAPTOP_LEARNER: dict[str, Any] = {
         "learning_rate": 1e-3,
         "learning_rate_bounds": (1e-5, 1e-3),
     },
-    "run": {"steps": 40_000_000},
+    "run": {"steps": 60_000_000},
 }
 
 _LAPTOP = _override(
@@ -58,7 +58,7 @@ _LAPTOP = _override(
         "cycle_follows_speed": True,
         "random_phase": True,
     },
-    curriculum={"settle_seconds": 2.0},
+    curriculum={"settle_seconds": 2.0, "v_limit": 4.5},
     rewards={
         "base_height_kernel": 30.0,
         "clearance_width": 0.03,
