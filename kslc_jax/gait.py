@@ -32,6 +32,7 @@ class GaitState:
     air_time: jax.Array  # [2] s since the last contact, 0 in contact
     landing: jax.Array  # [2] s, air time that ended this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
+    mean_velocity: jax.Array  # [2] m/s, base frame, averaged over about one cycle
     stance: jax.Array  # [2] bool, where the clock wants the feet down
     clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
 
@@ -48,6 +49,7 @@ def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array
         air_time=zeros,
         landing=zeros,
         swing_height=zeros,
+        mean_velocity=zeros,
         stance=stance,
         clock=clock,
     )
@@ -80,6 +82,8 @@ def update(
         air_time=jnp.where(grounded, 0.0, air_time),
         landing=jnp.where(flown & grounded, air_time, 0.0),
         swing_height=foot_z - state.lift_z,
+        mean_velocity=state.mean_velocity
+        + dt / cycle_time * (signals.base_linvel[:2] - state.mean_velocity),
         stance=stance,
         clock=clock,
     )
@@ -89,9 +93,16 @@ def _clock(config: GaitConfig, phase: jax.Array, command: Command) -> tuple[jax.
     """sin and cos of the phase [2], and the stance mask [2]."""
     angle = 2.0 * jnp.pi * phase
     s = jnp.sin(angle)
-    stance = jnp.stack([s >= 0.0, s < 0.0]) | (jnp.abs(s) < config.double_support)
+    run = jnp.square(_share_of_full_speed(config, command))
+    both = config.double_support + run * (config.double_support_at_speed - config.double_support)
+    stance = jnp.stack([s >= 0.0, s < 0.0]) | (jnp.abs(s) < both)
+    stance = stance & (jnp.abs(s) >= -both)
     clock = jnp.stack([s, jnp.cos(angle)]) * command.moving
     return clock, stance | ~command.moving
+
+
+def _share_of_full_speed(config: GaitConfig, command: Command) -> jax.Array:
+    return jnp.clip(jnp.abs(command.velocity[0]) / config.full_speed, 0.0, 1.0)
 
 
 def cycle_time(config: GaitConfig, command: Command, curriculum_cycle, v_max) -> jax.Array:
@@ -111,7 +122,7 @@ def reference_pose(
     of their side, and with `elbow_bend` the elbows flex. All zero at their Humanoid-Gym settings
     but the legs.
     """
-    share = jnp.clip(jnp.abs(command.velocity[0]) / config.full_speed, 0.0, 1.0)
+    share = _share_of_full_speed(config, command)
     s, c = state.clock
     swing = jnp.where(jnp.abs(s) < config.double_support, 0.0, s)
     leg = config.reference_scale * (1.0 + config.reference_speed_gain * share)

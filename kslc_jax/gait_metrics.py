@@ -1,9 +1,11 @@
 """Numbers that describe how a robot moves, from a `Trace`; numpy only.
 
 All take the trace of one commanded speed, [T, N, ...], and count only trials that did not fall,
-after some time to settle; `summary` puts them together.
+after some time to settle; `summary` puts them together. Angular momenta are about the whole-body
+centre of mass (paper, Eq. 3).
 """
 
+import mujoco
 import numpy as np
 
 from kslc_jax.robot import Robot
@@ -12,6 +14,9 @@ from kslc_jax.trials import Trace
 GRAVITY = 9.81
 SETTLE = 2.0
 """Seconds at the start that do not count: the robot gathers speed."""
+
+MOMENTUM_EVERY = 0.05
+"""Seconds between the samples of the limbs' angular momentum."""
 
 CHATTER = 0.05
 """Seconds off the ground below which a foot has not left it."""
@@ -133,14 +138,48 @@ def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     return out
 
 
-def momentum(trace: Trace, dt: float) -> dict[str, float]:
-    """Root mean square of the whole-body angular momentum [kg m^2/s]."""
+def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """Angular momentum of every body about the whole-body CoM [bodies, 3], world, kg m^2/s, at the
+    qpos and qvel of `data`."""
+    for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+        stage(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    # cvel is the velocity at the point of each body that is now at the whole-body CoM.
+    spin, at_com = data.cvel[:, :3], data.cvel[:, 3:]
+    arm = data.xipos - data.subtree_com[0]
+    moving = at_com + np.cross(spin, arm) - data.subtree_linvel[0]
+    rotation = data.ximat.reshape(-1, 3, 3)
+    principal = model.body_inertia * np.einsum("bij,bi->bj", rotation, spin)
+    spinning = np.einsum("bij,bj->bi", rotation, principal)
+    return model.body_mass[:, None] * np.cross(arm, moving) + spinning
+
+
+def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
+    """Root mean square angular momentum of the whole body, and about the vertical of its parts."""
     s = _steady(trace, dt)
     squares = (s.angular_momentum**2).mean((0, 1))
-    return {
+    out = {
         "momentum_rms": float(np.sqrt(squares.sum())),
         "momentum_yaw_rms": float(np.sqrt(squares[2])),
     }
+    every = round(MOMENTUM_EVERY / dt)
+    qpos = np.asarray(s.qpos[::every], np.float64).reshape(-1, s.qpos.shape[-1])
+    linvel, angvel, joints = (
+        np.asarray(x[::every], np.float64).reshape(len(qpos), -1)
+        for x in (s.linvel, s.angvel, s.joint_vel)
+    )
+    model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
+    yaw = np.empty((len(qpos), model.nbody))
+    for i, q in enumerate(qpos):
+        data.qpos[:] = q
+        mujoco.mju_rotVecQuat(data.qvel[:3], linvel[i], q[3:7])
+        data.qvel[3:6], data.qvel[6:] = angvel[i], joints[i]
+        yaw[i] = body_momentum(model, data)[:, 2]
+    names = [model.body(i).name for i in range(model.nbody)]
+    for part, words in {"arms": ("shoulder", "elbow"), "legs": ("leg", "knee", "ankle")}.items():
+        mine = [any(f"_{word}_" in name for word in words) for name in names]
+        out[f"{part}_momentum_yaw_rms"] = float(np.sqrt(np.mean(yaw[:, mine].sum(1) ** 2)))
+    return out
 
 
 def summary(trace: Trace, command: float, robot: Robot, dt: float) -> dict[str, float]:
@@ -153,5 +192,5 @@ def summary(trace: Trace, command: float, robot: Robot, dt: float) -> dict[str, 
         | effort(trace, robot, dt)
         | strides(trace, dt)
         | symmetry(trace, robot, dt)
-        | momentum(trace, dt)
+        | momentum(trace, robot, dt)
     )

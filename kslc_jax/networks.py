@@ -26,13 +26,14 @@ class MLP(nn.Module):
 
     hidden: tuple[int, ...]
     outputs: int
+    out_scale: float
 
     @nn.compact
     def __call__(self, frames: jax.Array) -> jax.Array:
         x = _flat(frames)
         for size in self.hidden:
             x = nn.elu(nn.Dense(size)(x))
-        return nn.Dense(self.outputs)(x)
+        return nn.Dense(self.outputs, kernel_init=_kernel_init(self.out_scale))(x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,7 @@ class MirrorMLP(nn.Module):
     hidden: tuple[int, ...]
     inputs: Parity
     outputs: Parity
+    out_scale: float
 
     @nn.compact
     def __call__(self, frames: jax.Array) -> jax.Array:
@@ -76,10 +78,17 @@ class MirrorMLP(nn.Module):
             even, odd = nn.Dense(size // 2)(even), nn.Dense(size // 2, use_bias=False)(odd)
             left, right = nn.elu((even + odd) * _HALF), nn.elu((even - odd) * _HALF)
             even, odd = (left + right) * _HALF, (left - right) * _HALF
-        out = nn.Dense(self.outputs.even.shape[1])(even) @ self.outputs.even.T
-        if self.outputs.odd.shape[1]:
-            out += nn.Dense(self.outputs.odd.shape[1], use_bias=False)(odd) @ self.outputs.odd.T
+        init = _kernel_init(self.out_scale)
+        out = nn.Dense(self.outputs.even.shape[1], kernel_init=init)(even) @ self.outputs.even.T
+        width = self.outputs.odd.shape[1]
+        if width:
+            out += nn.Dense(width, use_bias=False, kernel_init=init)(odd) @ self.outputs.odd.T
         return out
+
+
+def _kernel_init(scale: float) -> nn.initializers.Initializer:
+    """Unit-variance outputs for unit-variance inputs, times `scale`."""
+    return nn.initializers.variance_scaling(scale**2, "fan_in", "truncated_normal")
 
 
 def _flat(frames: jax.Array) -> jax.Array:
@@ -115,17 +124,18 @@ class Gaussian:
 
 
 def _actor(config: Config) -> nn.Module:
+    scale = config.network.init_mean
     if not config.network.symmetric:
-        return MLP(config.network.actor, NUM_JOINTS)
+        return MLP(config.network.actor, NUM_JOINTS, scale)
     inputs = parity(*observations.mirror_map(observations.ACTOR))
-    return MirrorMLP(config.network.actor, inputs, parity(*robot_lib.mirror_joints()))
+    return MirrorMLP(config.network.actor, inputs, parity(*robot_lib.mirror_joints()), scale)
 
 
 def _critic(config: Config) -> nn.Module:
     if not config.network.symmetric:
-        return MLP(config.network.critic, 1)
+        return MLP(config.network.critic, 1, 1.0)
     inputs = parity(*observations.mirror_map(observations.CRITIC))
-    return MirrorMLP(config.network.critic, inputs, parity(np.zeros(1, int), np.ones(1)))
+    return MirrorMLP(config.network.critic, inputs, parity(np.zeros(1, int), np.ones(1)), 1.0)
 
 
 def init(config: Config, key: jax.Array) -> Params:

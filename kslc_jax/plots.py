@@ -1,7 +1,9 @@
-"""Figures from stored data: python -m kslc_jax.plots RUN... --out curve.png
+"""Figures from stored data: python -m kslc_jax.plots {training,performance,momentum} ...
 
-Each RUN is a run folder or a metrics.jsonl. Prints when the commanded-speed range grew, and draws
-the learning curve over environment steps: speed range, tracking, episode length, throughput.
+Examples:
+  python -m kslc_jax.plots training runs/laptop-seed0 --out curve.png
+  python -m kslc_jax.plots performance runs/compare/*/evaluation.json --out performance.png
+  python -m kslc_jax.plots momentum runs/compare/*/evaluation.json --out momentum.png
 """
 
 import json
@@ -25,6 +27,21 @@ PANELS: tuple[tuple[str, str, str], ...] = (
     ("curriculum/tracking", "tracking reward, share of maximum", "C1"),
     ("episode_steps", "episode length [control steps]", "C2"),
     ("steps_per_second", "throughput [control steps/s]", "C3"),
+)
+
+
+PERFORMANCE: tuple[tuple[str, str], ...] = (
+    ("forward_mean", "mean forward speed [m/s]"),
+    ("survival", "share that did not fall"),
+    ("forward_std", "forward fluctuation [m/s]"),
+    ("lateral_std", "lateral fluctuation [m/s]"),
+    ("yaw_rate_std", "yaw-rate fluctuation [rad/s]"),
+    ("cost_of_transport", "cost of transport"),
+)
+MOMENTUM: tuple[tuple[str, str], ...] = (
+    ("momentum_yaw_rms", "whole body"),
+    ("legs_momentum_yaw_rms", "legs"),
+    ("arms_momentum_yaw_rms", "arms"),
 )
 
 
@@ -68,6 +85,65 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
             xytext=(4, -16),
             fontsize=7,
         )
+    _save(figure, out)
+
+
+def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, float]]]]:
+    """Rows of evaluation files by method: the folder's name without '-seedN'; ValueError."""
+    found: dict[str, list[list[dict[str, float]]]] = {}
+    for path in paths:
+        try:
+            rows = json.loads(path.read_text())["rows"]
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is no evaluation (made by evaluate --json)") from error
+        name = path.stem if path.parent.name == "" else path.parent.name
+        found.setdefault(name.rsplit("-seed", 1)[0], []).append(rows)
+    return found
+
+
+def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: str, **style):
+    """Mean over seeds of one metric over the commanded speed, and the seeds' range."""
+    commands = [row["command"] for row in seeds[0]]
+    values = np.array([[row.get(name, np.nan) for row in rows] for rows in seeds])
+    axis.plot(commands, values.mean(0), "o-", color=color, label=label, markersize=3, **style)
+    axis.fill_between(commands, values.min(0), values.max(0), color=color, alpha=0.2, linewidth=0)
+
+
+def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
+    """The paper's performance figure: one panel per metric, over the commanded speed."""
+    figure, axes = plt.subplots(2, 3, figsize=(12, 6.5), sharex=True)
+    for axis, (name, label) in zip(axes.flat, PERFORMANCE, strict=True):
+        for i, (method, seeds) in enumerate(methods.items()):
+            _over_commands(axis, method, f"C{i}", seeds, name)
+        axis.set_title(label, fontsize=9)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    top = max(row["command"] for seeds in methods.values() for row in seeds[0])
+    axes[0, 0].plot([0, top], [0, top], "k:", linewidth=1, label="commanded")
+    axes[0, 0].legend(fontsize=8)
+    for axis in axes[1]:
+        axis.set_xlabel("commanded speed [m/s]")
+    _save(figure, out)
+
+
+def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
+    """Angular momentum about the vertical of whole body, legs and arms, a panel per method."""
+    figure, axes = plt.subplots(
+        1, len(methods), figsize=(4.5 * len(methods), 4), sharey=True, squeeze=False
+    )
+    for axis, (method, seeds) in zip(axes[0], methods.items(), strict=True):
+        for i, (name, label) in enumerate(MOMENTUM):
+            _over_commands(axis, label, f"C{i}", seeds, name)
+        axis.set_title(method)
+        axis.set_xlabel("commanded speed [m/s]")
+        axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("yaw angular momentum, rms [kg m²/s]")
+    axes[0, 0].set_ylim(bottom=0)
+    axes[0, 0].legend()
+    _save(figure, out)
+
+
+def _save(figure, out: Path) -> None:
     figure.tight_layout()
     out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(out, dpi=130)
@@ -75,27 +151,58 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
 
 
 @dataclass(frozen=True)
-class Args:
-    """Learning curves of one or more runs."""
+class Training:
+    """When the commanded-speed range grew, and the learning curve over environment steps: speed
+    range, tracking, episode length, throughput."""
 
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Run folders or metrics.jsonl files."""
     out: Path = Path("learning_curve.png")
+    """Where the figure goes."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    args = tyro.cli(Args, args=argv, description=__doc__)
-    try:
-        runs = {str(path): read_metrics(path) for path in args.runs}
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+@dataclass(frozen=True)
+class Performance:
+    """Speed, survival and fluctuations over the commanded speed; mean and range over seeds."""
+
+    evaluations: tyro.conf.Positional[tuple[Path, ...]]
+    """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
+    out: Path = Path("performance.png")
+    """Where the figure goes."""
+
+
+@dataclass(frozen=True)
+class Momentum:
+    """Yaw angular momentum of arms, legs and whole body over the commanded speed."""
+
+    evaluations: tyro.conf.Positional[tuple[Path, ...]]
+    """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
+    out: Path = Path("momentum.png")
+    """Where the figure goes."""
+
+
+def draw(args: Training | Performance | Momentum) -> None:
+    """Draws the asked figure; ValueError where the data is missing."""
+    if not isinstance(args, Training):
+        drawing = performance if isinstance(args, Performance) else momentum
+        drawing(read_evaluations(args.evaluations), args.out)
+        return
+    runs = {str(path): read_metrics(path) for path in args.runs}
     for run, records in runs.items():
         print(run)
         for v, steps, seconds in milestones(records):
             print(f"  v_max {v:.1f} m/s at {steps / 1e6:5.1f} M steps, {seconds / 60:3.0f} min")
     learning_curve(runs, args.out)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = tyro.cli(Training | Performance | Momentum, args=argv, description=__doc__)
+    try:
+        draw(args)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     print(f"wrote {args.out}")
     return 0
 

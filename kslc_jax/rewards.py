@@ -56,7 +56,9 @@ def angular_momentum(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> j
 def base_height(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """Eq. 6 as read: exp(-beta |h - (1 - gamma g) target|); HG's with g = 0."""
     stance = x.gait.stance.astype(jnp.float32)
-    sole = jnp.sum(x.signals.foot_pos[:, 2] * stance) / jnp.sum(stance) - SOLE_DROP
+    feet = jnp.sum(x.signals.foot_pos[:, 2] * stance) / jnp.maximum(jnp.sum(stance), 1.0)
+    # Where the clock wants the robot to fly there is no stance foot: the floor counts.
+    sole = jnp.where(jnp.any(x.gait.stance), feet - SOLE_DROP, 0.0)
     height = x.signals.base_pos[2] - sole
     drop = cfg.base_height_drop * speed_share(x.command, x.v_max) if cfg.velocity_rewards else 0.0
     target = cfg.base_height_target * (1.0 - drop)
@@ -120,6 +122,13 @@ def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
     angular = jnp.abs(x.signals.base_angvel[2] - x.command.velocity[2])
     kernels = 0.5 * (jnp.exp(-10.0 * linear) + jnp.exp(-10.0 * angular))
     return kernels - 0.2 * (linear + angular)
+
+
+def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
+    """exp(-10 |xy error of the mean velocity|), the mean over about one gait cycle (ours).
+
+    Within a stride the speed swings by more than the error that matters over many strides."""
+    return jnp.exp(-10.0 * norm(x.gait.mean_velocity - x.command.velocity[:2]))
 
 
 # --------------------------------------------------------------------------------------- HG: feet
@@ -252,6 +261,7 @@ TERMS: dict[str, Term] = {
         vel_mismatch_exp,
         low_speed,
         track_vel_hard,
+        tracking_mean_vel,
         feet_contact_number,
         feet_air_time,
         foot_slip,

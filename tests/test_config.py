@@ -172,7 +172,7 @@ LEARNER = {
     "ppo.entropy_coef": 0.003,
     "ppo.learning_rate": 1e-3,
     "ppo.learning_rate_bounds": (1e-5, 1e-3),
-    "run.steps": 40_000_000,
+    "run.steps": 60_000_000,
 }
 
 
@@ -184,12 +184,20 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "command.forward_fraction": 0.2,
         "command.narrow_speed": 4.0,
         "command.stand_still": True,
+        "gait.double_support_at_speed": -0.3,
         "gait.reference_speed_gain": 1.0,
         "gait.arm_swing": 0.5,
         "gait.elbow_bend": 1.0,
         "gait.cycle_follows_speed": True,
         "gait.random_phase": True,
         "curriculum.settle_seconds": 2.0,
+        "curriculum.v_limit": 4.5,
+        "randomize.base_com": (-0.02, 0.02),
+        "randomize.kp": (0.9, 1.1),
+        "randomize.kd": (0.9, 1.1),
+        "randomize.motor_strength": (0.9, 1.0),
+        "randomize.joint_friction": (0.0, 0.5),
+        "randomize.push_velocity": 0.3,
         "rewards.base_height_kernel": 30.0,
         "rewards.clearance_width": 0.03,
         "rewards.max_contact_force": 1400.0,
@@ -197,6 +205,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.lean_per_speed": 0.03,
         "rewards.weights.tracking_lin_vel": 1.6,
         "rewards.weights.track_vel_hard": 0.8,
+        "rewards.weights.tracking_mean_vel": 1.0,
         "rewards.weights.dof_vel_limits": -0.5,
         "rewards.weights.stand_still": -0.3,
     }

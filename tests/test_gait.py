@@ -65,6 +65,34 @@ def test_clock(phase, sin, cos):
     np.testing.assert_allclose(at_phase(phase).clock, [sin, cos], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("vx", "phase", "left", "right"),
+    [
+        (0.0, 0.0159, True, True),  # walking: as without
+        (3.5, 0.0, False, False),  # at full speed both fly where abs(sin) < 0.3
+        (3.5, 0.0484, False, False),  # sin = 0.2992
+        (3.5, 0.0486, True, False),  # sin = 0.3004
+        (-3.5, 0.0484, False, False),
+        (7.0, 0.0486, True, False),
+        (1.75, 0.0001, True, False),  # (1.75 / 3.5)^2 (0.3 + 0.1) = 0.1: neither
+        (2.475, 0.0158, False, False),  # half way: flight below 0.1
+        (2.475, 0.0161, True, False),
+    ],
+)
+def test_double_support_turns_into_flight_with_the_square_of_the_speed(vx, phase, left, right):
+    config = dataclasses.replace(PAPER, double_support_at_speed=-0.3)
+    state = at_phase(phase, make_command(velocity=[vx, 0.0, 0.0]), config)
+    assert state.stance.tolist() == [left, right]
+
+
+def test_mean_velocity_forgets_over_a_cycle():
+    """First order, dt / cycle = 0.01 / 0.5 a step: 1 - 0.98^50 = 0.6358 after a cycle at 1 m/s."""
+    state, signals = make_gait(), make_signals(base_linvel=[1.0, -2.0, 5.0])
+    for _ in range(50):
+        state = update(PAPER, state, signals, make_command(), jnp.asarray(0.5))
+    np.testing.assert_allclose(state.mean_velocity, [0.63583, -1.27166], rtol=1e-4)
+
+
 def test_clock_runs_once_around_in_a_cycle():
     """0.01 / 0.64 = 1/64 is exact: a quarter after 16 steps, back at 0 after 64."""
     state, phases = make_gait(), []

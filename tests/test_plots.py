@@ -32,13 +32,43 @@ def test_milestones(run_dir):
 
 def test_learning_curve_is_drawn(run_dir, tmp_path):
     out = tmp_path / "figures" / "curve.png"
-    assert plots.main([str(run_dir), "--out", str(out)]) == 0
+    assert plots.main(["training", str(run_dir), "--out", str(out)]) == 0
     import matplotlib.image
 
     image = matplotlib.image.imread(out)
     assert image.shape[0] > 500 and np.std(image) > 0.05
 
 
+@pytest.fixture
+def evaluations(tmp_path):
+    paths = []
+    for name, gain in (("kslc-seed0", 1.0), ("kslc-seed1", 0.9), ("baseline-seed0", 0.2)):
+        metrics = [key for key, _ in plots.PERFORMANCE + plots.MOMENTUM]
+        rows = [{"command": v, **dict.fromkeys(metrics, gain * v)} for v in (1.0, 2.0, 3.0)]
+        (tmp_path / name).mkdir()
+        paths.append(tmp_path / name / "evaluation.json")
+        paths[-1].write_text(json.dumps({"rows": rows}))
+    return paths
+
+
+def test_seeds_of_a_method_belong_together(evaluations):
+    found = plots.read_evaluations(evaluations)
+    assert {name: len(seeds) for name, seeds in found.items()} == {"kslc": 2, "baseline": 1}
+
+
+@pytest.mark.parametrize("figure", ["performance", "momentum"])
+def test_figures_of_evaluations_are_drawn(figure, evaluations, tmp_path):
+    out = tmp_path / f"{figure}.png"
+    assert plots.main([figure, *map(str, evaluations), "--out", str(out)]) == 0
+    assert out.stat().st_size > 10_000
+
+
+def test_not_an_evaluation(tmp_path, capsys):
+    (tmp_path / "x.json").write_text("[]")
+    assert plots.main(["performance", str(tmp_path / "x.json")]) == 2
+    assert "is no evaluation" in capsys.readouterr().err
+
+
 def test_missing_run(tmp_path, capsys):
-    assert plots.main([str(tmp_path / "none")]) == 2
+    assert plots.main(["training", str(tmp_path / "none")]) == 2
     assert capsys.readouterr().err.startswith("error: no metrics.jsonl")

@@ -116,6 +116,13 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("base_height", LOOSE, {"base_pos": [0, 0, 0.79]}, 0.04978707),
     # Fixed target: error 0.01225, e^-1.225.
     ("base_height", HG, {"vx": 1.75, "base_pos": [0, 0, 0.87775]}, 0.29375770),
+    # In flight the floor counts, wherever the feet are.
+    (
+        "base_height",
+        HG,
+        {"stance": [False, False], "foot_pos": [[0, 0.15, 0.2], [0, -0.15, 0.3]]},
+        1.0,
+    ),
     # A swing foot in the air does not count; two stance feet give the mean: 0.06 - 0.05 = 0.01.
     (
         "base_height",
@@ -229,6 +236,13 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("low_speed", KSLC, {"vx": -0.3, "base_linvel": [-0.1, 0, 0]}, -1.0),
     ("low_speed", KSLC, {"vx": 0.05, "base_linvel": [-1.0, 0, 0]}, 0.0),
     ("low_speed", KSLC, {"velocity": [0.0, 0.3, 0.0], "base_linvel": [1.0, 0, 0]}, 0.0),
+    # The mean velocity counts, not today's: |(0.06, -0.08)| = 0.1: e^-1.
+    (
+        "tracking_mean_vel",
+        KSLC,
+        {"velocity": [1.0, 0, 0.5], "mean_velocity": [1.06, -0.08], "base_linvel": [9, 9, 9]},
+        0.36787944,
+    ),
     # e_xy = 0.5, e_yaw = 0.2: (e^-5 + e^-2) / 2 - 0.2 * 0.7 = 0.0710366 - 0.14.
     (
         "track_vel_hard",
@@ -400,14 +414,14 @@ def test_every_term_has_a_case():
 
 def test_terms_and_weights_are_one_to_one():
     assert names(RewardWeights) == set(rewards.TERMS)
-    assert len(rewards.TERMS) == 25
+    assert len(rewards.TERMS) == 26
     assert all(name == term.__name__ for name, term in rewards.TERMS.items())
 
 
 @pytest.mark.parametrize("name", ["paper", "baseline", "baseline-laptop"])
 def test_weights_are_humanoid_gyms(name):
     weights = dataclasses.asdict(preset(name).rewards.weights)
-    ours = {"angular_momentum", "dof_vel_limits", "stand_still"}
+    ours = {"angular_momentum", "tracking_mean_vel", "dof_vel_limits", "stand_still"}
     assert {k: v for k, v in weights.items() if k not in ours} == HUMANOID_GYM
     assert weights["angular_momentum"] == (0.05 if name == "paper" else 0.0)
     assert weights["dof_vel_limits"] == weights["stand_still"] == 0.0

@@ -3,6 +3,7 @@
 import json
 
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -106,6 +107,28 @@ def test_a_fall_counts_as_zero_speed(xbot):
     assert m["survival"] == 0.5 and m["forward_mean"] == pytest.approx(1.0)
     nobody = gait_metrics.summary(trace.replace(alive=alive & False), 2.0, xbot, DT)
     assert nobody["survival"] == 0.0 and nobody["forward_mean"] == 0.0
+
+
+def test_bodies_angular_momenta_add_up_to_the_whole_bodys(xbot):
+    model, data = xbot.mj_model, mujoco.MjData(xbot.mj_model)
+    rng = np.random.default_rng(0)
+    data.qpos[:] = xbot.default_qpos
+    data.qpos[3:] += 0.5 * rng.normal(size=20)
+    data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+    data.qvel[:] = 3.0 * rng.normal(size=22)
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    parts = gait_metrics.body_momentum(model, data)
+    np.testing.assert_allclose(parts.sum(0), data.subtree_angmom[0], rtol=1e-9)
+
+
+def test_arms_momentum_is_theirs_alone(xbot):
+    """Arms swing against each other about a still body: the legs have (almost) none."""
+    trace = synthetic()
+    joint_vel = trace.joint_vel.copy()
+    joint_vel[..., 12:16] = 3.0
+    m = gait_metrics.momentum(trace.replace(joint_vel=joint_vel, linvel=0 * trace.linvel), xbot, DT)
+    assert m["arms_momentum_yaw_rms"] > 0.2 > 10 * m["legs_momentum_yaw_rms"]
 
 
 def test_sweep_and_table(still):

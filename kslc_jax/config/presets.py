@@ -52,6 +52,7 @@ _LAPTOP = _override(
         "stand_still": True,
     },
     gait={
+        "double_support_at_speed": -0.3,
         "reference_speed_gain": 1.0,
         "arm_swing": 0.5,
         "elbow_bend": 1.0,
@@ -59,6 +60,14 @@ _LAPTOP = _override(
         "random_phase": True,
     },
     curriculum={"settle_seconds": 2.0, "v_limit": 4.5},
+    randomize={
+        "base_com": (-0.02, 0.02),
+        "kp": (0.9, 1.1),
+        "kd": (0.9, 1.1),
+        "motor_strength": (0.9, 1.0),
+        "joint_friction": (0.0, 0.5),
+        "push_velocity": 0.3,
+    },
     rewards={
         "base_height_kernel": 30.0,
         "clearance_width": 0.03,
@@ -68,6 +77,7 @@ _LAPTOP = _override(
         "weights": {
             "tracking_lin_vel": 1.6,
             "track_vel_hard": 0.8,
+            "tracking_mean_vel": 1.0,
             "dof_vel_limits": -0.5,
             "stand_still": -0.3,
         },

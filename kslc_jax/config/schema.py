@@ -147,6 +147,9 @@ class GaitConfig:
     """Seconds per gait cycle at the start of the curriculum (HG)."""
     double_support: float = 0.1
     """Both feet stand where abs(sin(phase)) is below this (HG)."""
+    double_support_at_speed: float = 0.1
+    """What `double_support` turns into at `full_speed`, with the square of the speed. Below zero it
+    is flight: no foot stands where abs(sin(phase)) is below its size."""
     reference_scale: float = 0.17
     """Amplitude of the hip and ankle reference [rad]; the knee's is twice that (HG)."""
     reference_speed_gain: float = 0.0
@@ -165,6 +168,10 @@ class GaitConfig:
     def __post_init__(self):
         require(self.cycle_time > 0, "gait.cycle_time must be positive")
         require(0 <= self.double_support < 1, "gait.double_support must lie in [0, 1)")
+        require(
+            -1 < self.double_support_at_speed < 1,
+            "gait.double_support_at_speed must lie in (-1, 1)",
+        )
         require(self.full_speed > 0, "gait.full_speed must be positive")
 
 
@@ -237,6 +244,7 @@ class RewardWeights:
     dof_acc: float = -1e-7
     collision: float = -1.0
     # Ours, off in the paper's presets.
+    tracking_mean_vel: float = 0.0
     dof_vel_limits: float = 0.0
     stand_still: float = 0.0
 
@@ -338,6 +346,8 @@ class NetworkConfig:
     actor: tuple[int, ...] = (512, 256, 128)
     critic: tuple[int, ...] = (768, 256, 128)
     init_std: float = 1.0
+    init_mean: float = 1.0
+    """Size of the untrained actor's outputs; near 0 every robot starts by holding its pose."""
     symmetric: bool = False
     """Networks that commute with left-right mirroring by construction: a mirrored robot gets the
     mirrored action and the same value. At equal sizes half the work of free ones."""

@@ -9,6 +9,13 @@ from kslc_jax.config.schema import Config, require
 
 SCHEMA_VERSION = 1
 
+YOUNGER = {
+    "config.network.init_mean",
+    "config.gait.double_support_at_speed",
+    "config.rewards.weights.tracking_mean_vel",
+}
+"""Fields that older files of this version lack; their defaults are what was there before."""
+
 
 def to_dict(config: Config) -> dict[str, Any]:
     """Plain nested dict for JSON, with the schema version."""
@@ -33,9 +40,9 @@ def _build(cls: Any, data: Any, where: str) -> Any:
     hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
     unknown = set(data) - set(hints)
     require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
-    missing = set(hints) - set(data)
-    require(not missing, f"{where}: missing field {', '.join(sorted(missing))}")
-    return cls(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in hints})
+    missing = sorted(n for n in set(hints) - set(data) if f"{where}.{n}" not in YOUNGER)
+    require(not missing, f"{where}: missing field {', '.join(missing)}")
+    return cls(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in data})
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
