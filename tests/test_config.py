@@ -164,9 +164,10 @@ def test_baseline_is_humanoid_gym():
 LEARNER = {
     "env.num_envs": 2048,
     "env.frames": 5,
-    "network.actor": (256, 128, 64),
+    "network.actor": (384, 192, 96),
     "network.critic": (256, 128, 64),
     "network.init_std": 0.6,
+    "network.init_mean": 0.01,
     "ppo.rollout_steps": 24,
     "ppo.epochs": 5,
     "ppo.entropy_coef": 0.003,

@@ -30,7 +30,12 @@ _BASELINE = _override(
 # Learns fast on two CPU cores. What it changes and why: docs/fidelity.md, "The laptop preset".
 _LAPTOP_LEARNER: dict[str, Any] = {
     "env": {"num_envs": 2048, "frames": 5},
-    "network": {"actor": (256, 128, 64), "critic": (256, 128, 64), "init_std": 0.6},
+    "network": {
+        "actor": (384, 192, 96),
+        "critic": (256, 128, 64),
+        "init_std": 0.6,
+        "init_mean": 0.01,
+    },
     "ppo": {
         "rollout_steps": 24,
         "minibatches": 4,
