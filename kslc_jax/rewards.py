@@ -127,8 +127,11 @@ def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
 def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """exp(-10 |xy error of the mean velocity|), the mean over about one gait cycle (ours).
 
-    Within a stride the speed swings by more than the error that matters over many strides."""
-    return jnp.exp(-10.0 * norm(x.gait.mean_velocity - x.command.velocity[:2]))
+    Within a stride the speed swings by more than the error that matters over many strides. Grows
+    with the commanded range, from nothing at the start: exact speed is for those who can walk."""
+    exact = jnp.exp(-10.0 * norm(x.gait.mean_velocity - x.command.velocity[:2]))
+    grown = (x.v_max - cfg.exact_from) / (cfg.exact_full - cfg.exact_from)
+    return exact * jnp.clip(grown, 0.0, 1.0)
 
 
 # --------------------------------------------------------------------------------------- HG: feet

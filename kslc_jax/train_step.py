@@ -183,8 +183,9 @@ def _progress(out: Outcome) -> Progress:
     tracking, tracking_count = mean_over(out.tracking, out.settled)
     fast_tracking, fast_count = mean_over(out.tracking, out.fast)
     episode_steps, episode_count = mean_over(out.episode_steps, done)
+    gait, _ = mean_over(out.terms["feet_contact_number"], ~out.broken)
     return Progress(
-        tracking, tracking_count, fast_tracking, fast_count, episode_steps, episode_count
+        tracking, tracking_count, fast_tracking, fast_count, episode_steps, episode_count, gait
     )
 
 
@@ -206,6 +207,7 @@ def _metrics(
         "curriculum/cycle_time": state.curriculum.cycle_time,
         "curriculum/tracking": state.curriculum.tracking,
         "curriculum/fast_tracking": state.curriculum.fast_tracking,
+        "curriculum/gait": state.curriculum.gait,
         "ppo/learning_rate": state.learner.learning_rate,
         "ppo/std": jnp.mean(jnp.exp(networks.log_std(config, state.learner.params))),
         **{f"ppo/{name}": value for name, value in losses.items()},

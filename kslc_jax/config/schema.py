@@ -289,6 +289,10 @@ class RewardConfig:
     knee_distance: Range = (0.2, 0.25)
     lean_per_speed: float = 0.0
     """Forward lean [rad per m/s] that `orientation` takes as upright."""
+    exact_from: float = 0.5
+    """Upper end of the commanded range [m/s] up to which `tracking_mean_vel` is nothing."""
+    exact_full: float = 2.5
+    """The same from where on it has its full size."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which dof_vel_limits counts."""
 
@@ -297,6 +301,7 @@ class RewardConfig:
         require(self.momentum_floor < 0, "rewards.momentum_floor must be negative")
         require(self.clearance_width > 0, "rewards.clearance_width must be positive")
         require(self.max_contact_force >= 0, "rewards.max_contact_force must not be negative")
+        require(self.exact_from < self.exact_full, "rewards.exact_from must lie below exact_full")
         _check_range("rewards.feet_distance", self.feet_distance)
         _check_range("rewards.knee_distance", self.knee_distance)
 
@@ -321,6 +326,9 @@ class CurriculumConfig:
     fast_threshold: float = 0.7
     """Share of the maximal tracking reward that the fast commands must reach."""
     min_episode_steps: float = 1000.0
+    gait_threshold: float = -1.0
+    """Least mean of the `feet_contact_number` term, which is 1 where the feet follow the clock and
+    -0.3 where they do the contrary; -1: any. A shuffle can track, too."""
     settle_seconds: float = 0.0
     """Tracking counts from this long after a change of the command: reaching it takes time, and the
     longer the wider the range is."""

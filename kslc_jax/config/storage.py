@@ -13,6 +13,9 @@ YOUNGER = {
     "config.network.init_mean",
     "config.gait.double_support_at_speed",
     "config.rewards.weights.tracking_mean_vel",
+    "config.curriculum.gait_threshold",
+    "config.rewards.exact_from",
+    "config.rewards.exact_full",
 }
 """Fields that older files of this version lack; their defaults are what was there before."""
 
