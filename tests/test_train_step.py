@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import networks, observations, train_step
+from kslc_jax import networks, train_step
 from kslc_jax.config import preset
 
 
@@ -107,27 +107,6 @@ def test_broken_samples_are_masked(made):
     assert metrics["broken"] == pytest.approx(1 / config.batch_size)
     assert all(np.all(np.isfinite(x)) for x in leaves(new) if x.dtype.kind == "f")
     assert metrics["ppo/skipped"] == 0
-
-
-def test_symmetric_policy_mirrors_exactly():
-    """mean(M o) = M mean(o)."""
-    config = preset("laptop")
-    params = networks.init(config, jax.random.key(0))
-    permutation, sign = observations.mirror_map(observations.ACTOR)
-    history = jax.random.normal(jax.random.key(1), (7, config.env.frames, 59))
-    here = networks.policy(config, params, history).mean
-    there = networks.policy(config, params, history[..., permutation] * sign).mean
-    joints, joint_sign = train_step.networks.robot_lib.mirror_joints()
-    np.testing.assert_allclose(there, here[:, joints] * joint_sign, atol=1e-6)
-    assert float(jnp.abs(here).max()) > 0.01
-
-
-def test_networks_have_the_papers_sizes():
-    config = preset("paper")
-    params = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
-    shapes = lambda net: [params[net][f"Dense_{i}"]["kernel"].shape for i in range(4)]  # noqa: E731
-    assert shapes("actor") == [(15 * 59, 512), (512, 256), (256, 128), (128, 16)]
-    assert shapes("critic") == [(3 * 89, 768), (768, 256), (256, 128), (128, 1)]
 
 
 def test_paper_preset_traces():

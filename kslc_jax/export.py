@@ -1,0 +1,302 @@
+"""Takes a policy elsewhere: python -m kslc_jax.export POLICY policy.onnx
+
+Writes the network `history [batch, K, 59] -> action [batch, 16]` together with everything that a
+robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. OUT ends in
+.onnx or .stablehlo (read back by jax.export; the data go beside it in OUT.json). The file is then
+compared with JAX over observations of the policy at work. See docs/export.md.
+
+POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import numpy as np
+import tyro
+
+from kslc_jax import __version__, runtime
+from kslc_jax.config import NUM_JOINTS, Config, ConfigError
+
+if TYPE_CHECKING:
+    from kslc_jax.checkpoint import Policy
+    from kslc_jax.networks import Params, Parity
+
+Format = Literal["onnx", "stablehlo"]
+Network = Callable[[np.ndarray], np.ndarray]
+"""Histories [B, K, 59] to actions [B, 16]."""
+
+METADATA_VERSION = 1
+"""Of the names and meanings in `metadata`; grows when one of them changes."""
+
+INSTALL = "pip install 'kslc_jax[export]'"
+TOLERANCE = 1e-5
+"""Largest difference of an action component from JAX's; an action of 1 is `action_scale` rad."""
+SAMPLES = 1000
+"""Observations that the comparison takes."""
+
+_OPSET, _IR_VERSION = 17, 8
+"""Old enough for the runtimes on robots (onnxruntime 1.12, 2022)."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to write."""
+
+    policy: tyro.conf.Positional[Path]
+    """Run folder, checkpoint folder, or name of a shipped policy."""
+    out: tyro.conf.Positional[Path]
+    """File to write, .onnx or .stablehlo."""
+    format: Format | None = None
+    """Needed only where OUT's suffix does not say it."""
+
+    def __post_init__(self):
+        if self.chosen not in get_args(Format):
+            raise ConfigError(
+                f"out: '{self.out.name}' ends in neither .onnx nor .stablehlo; say it with --format"
+            )
+
+    @property
+    def chosen(self) -> str:
+        """The format given, or that of the suffix."""
+        return self.format or self.out.suffix[1:]
+
+
+def metadata(policy: Policy) -> dict[str, Any]:
+    """What it takes to run the network, JSON-ready: SI units, joints in action order."""
+    from kslc_jax import commands, observations, physics
+
+    config, robot = policy.config, physics.robot_for(policy.config.physics)
+    held = robot.is_arm & (config.env.arms == "held")
+    return {
+        "metadata_version": METADATA_VERSION,
+        "kslc_jax_version": __version__,
+        "train_step": policy.step,
+        "control_dt": config.control_dt,
+        "joint_names": list(robot.joint_names),
+        "default_joint_pos": robot.default_qpos[7:].tolist(),
+        "kp": robot.kp.tolist(),
+        "kd": robot.kd.tolist(),
+        "effort_limit": robot.effort_limit.tolist(),
+        "speed_limit": robot.speed_limit.tolist(),
+        "torque_knee": physics.TORQUE_KNEE,
+        "action_scale": config.env.action_scale,
+        "action_clip": config.env.action_clip,
+        "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],
+        "history_length": config.env.frames,
+        "observation_clip": config.env.observation_clip,
+        "frame": [{"name": c.name, "width": c.width, "scale": c.scale} for c in observations.ACTOR],
+        "gait": {
+            "cycle_time": float(policy.curriculum.cycle_time),
+            "v_max": float(policy.curriculum.v_max),
+            "cycle_follows_speed": config.gait.cycle_follows_speed,
+            "base_cycle_time": config.gait.cycle_time,
+        },
+        "command": {
+            "heading_gain": config.command.heading_gain,
+            "max_yaw_rate": config.command.max_yaw_rate,
+            "stand_still": config.command.stand_still,
+            "turning": commands.TURNING,
+        },
+    }
+
+
+# ------------------------------------------------------------------------------------------- onnx
+
+
+def dense_layers(config: Config, params: Params) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Kernels [in, out] and biases [out] of the actor as a plain MLP over the flat history.
+
+    A symmetric actor becomes one too: its even and odd layers are the blocks of an ordinary dense
+    layer in the bases of `networks.parity`. That is twice the work, and a graph any runtime knows.
+    """
+    import jax
+
+    from kslc_jax import networks, observations, robot
+
+    actor = jax.tree.map(lambda x: np.asarray(x, np.float64), params["actor"])
+    layers = [actor[f"Dense_{i}"] for i in range(len(actor))]
+    if not config.network.symmetric:
+        return [(layer["kernel"], layer["bias"]) for layer in layers]
+
+    def stacked(frame: Parity) -> Parity:
+        eye = np.eye(config.env.frames)
+        return networks.Parity(np.kron(eye, frame.even), np.kron(eye, frame.odd))
+
+    def pairs(size: int) -> Parity:
+        return networks.parity(np.roll(np.arange(size), size // 2), np.ones(size))
+
+    bases = [
+        stacked(networks.parity(*observations.mirror_map(observations.ACTOR))),
+        *map(pairs, config.network.actor),
+        networks.parity(*robot.mirror_joints()),
+    ]
+    return [
+        (
+            a.even @ even["kernel"] @ b.even.T + a.odd @ odd["kernel"] @ b.odd.T,
+            even["bias"] @ b.even.T,
+        )
+        for even, odd, a, b in zip(layers[::2], layers[1::2], bases[:-1], bases[1:], strict=True)
+    ]
+
+
+def to_onnx(policy: Policy) -> bytes:
+    """The network as ONNX: Flatten, then Gemm with Elu between; metadata as JSON values."""
+    from kslc_jax import observations
+
+    try:
+        from onnx import TensorProto, checker, helper, numpy_helper
+    except ImportError as error:
+        raise ConfigError(f"ONNX files need the package onnx: {INSTALL}") from error
+
+    def floats(name: str, *shape: str | int):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+
+    layers = dense_layers(policy.config, policy.params)
+    nodes, weights = [helper.make_node("Flatten", ["history"], ["input_0"], axis=1)], []
+    for i, layer in enumerate(layers):
+        names = [f"kernel_{i}", f"bias_{i}"]
+        weights += [
+            numpy_helper.from_array(x.astype(np.float32), name)
+            for x, name in zip(layer, names, strict=True)
+        ]
+        out = "action" if i == len(layers) - 1 else f"dense_{i}"
+        nodes.append(helper.make_node("Gemm", [f"input_{i}", *names], [out]))
+        if out != "action":
+            nodes.append(helper.make_node("Elu", [out], [f"input_{i + 1}"]))
+    history = floats("history", "batch", policy.config.env.frames, observations.ACTOR_WIDTH)
+    action = floats("action", "batch", NUM_JOINTS)
+    model = helper.make_model(
+        helper.make_graph(nodes, "policy", [history], [action], weights),
+        opset_imports=[helper.make_opsetid("", _OPSET)],
+        ir_version=_IR_VERSION,
+        producer_name="kslc_jax",
+        producer_version=__version__,
+    )
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in metadata(policy).items()})
+    checker.check_model(model, full_check=True)
+    return model.SerializeToString()
+
+
+def read_onnx(path: Path) -> Network:
+    """The file's network in onnxruntime; ImportError without it."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    return lambda histories: np.asarray(session.run(["action"], {"history": histories})[0])
+
+
+# -------------------------------------------------------------------------------------- stablehlo
+
+
+def to_stablehlo(policy: Policy) -> bytes:
+    """The network, serialised by `jax.export` for CPU, CUDA and TPU, with any batch size."""
+    import jax
+    import jax.export
+    import jax.numpy as jnp
+
+    from kslc_jax import observations
+
+    (batch,) = jax.export.symbolic_shape("batch")
+    shape = (batch, policy.config.env.frames, observations.ACTOR_WIDTH)
+    export = jax.export.export(jax.jit(jax.vmap(policy.act_on)), platforms=("cpu", "cuda", "tpu"))
+    return bytes(export(jax.ShapeDtypeStruct(shape, jnp.float32)).serialize())
+
+
+def read_stablehlo(path: Path) -> Network:
+    """The file's network, called by JAX."""
+    import jax.export
+
+    exported = jax.export.deserialize(bytearray(path.read_bytes()))
+    return lambda histories: np.asarray(exported.call(histories))
+
+
+# ------------------------------------------------------------------------------------- comparison
+
+WRITE = {"onnx": to_onnx, "stablehlo": to_stablehlo}
+READ = {"onnx": read_onnx, "stablehlo": read_stablehlo}
+
+
+def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
+    """Histories [SAMPLES, K, 59] that the policy meets following commands of its own range."""
+    import jax
+
+    from kslc_jax import env, trials
+
+    config = trials.trial_config(policy.config, trials.Setting(policy.config.physics), robots)
+
+    def one(states, key):
+        actions = jax.vmap(policy.act_on)(states.history)
+        new, _ = jax.vmap(env.step, (None, 0, 0, 0, None))(
+            config, states, actions, jax.random.split(key, robots), policy.curriculum
+        )
+        return new, states.history
+
+    def run(key):
+        key_reset, key_run = jax.random.split(key)
+        states = jax.vmap(env.reset, (None, 0, None))(
+            config, jax.random.split(key_reset, robots), policy.curriculum
+        )
+        return jax.lax.scan(one, states, jax.random.split(key_run, steps))[1]
+
+    histories = np.asarray(jax.jit(run)(jax.random.key(0)))
+    histories = histories.reshape(-1, *histories.shape[2:])
+    return histories[:: len(histories) // SAMPLES][:SAMPLES]
+
+
+def difference(policy: Policy, network: Network, histories: np.ndarray) -> float:
+    """Largest absolute difference between the network's actions and the policy's."""
+    import jax
+
+    with jax.default_matmul_precision("highest"):
+        wanted = np.asarray(jax.jit(jax.vmap(policy.act_on))(histories))
+    return float(np.max(np.abs(network(histories) - wanted)))
+
+
+def compare(policy: Policy, path: Path, form: str) -> str:
+    """Compares the file with the policy and says how; ConfigError if they are not the same."""
+    try:
+        network = READ[form](path)
+    except ImportError as error:
+        return f"not compared with JAX: {error.name} is missing, {INSTALL}"
+    histories = recorded(policy)
+    error = difference(policy, network, histories)
+    if not error <= TOLERANCE:
+        raise ConfigError(f"{path} differs from JAX by {error:.1e}: do not use it")
+    return f"equals JAX within {error:.1e} over {len(histories)} recorded observations"
+
+
+# ----------------------------------------------------------------------------------- command line
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    runtime.prepare()
+    try:
+        args = tyro.cli(Args, args=argv, description=__doc__)
+        from kslc_jax.checkpoint import CheckpointError, load_policy
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        policy = load_policy(args.policy)
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        args.out.write_bytes(WRITE[args.chosen](policy))
+        if args.chosen == "stablehlo":
+            beside = args.out.with_name(args.out.name + ".json")
+            beside.write_text(json.dumps(metadata(policy), indent=1))
+        print(f"wrote {args.out}, train step {policy.step}")
+        print(compare(policy, args.out, args.chosen))
+    except (CheckpointError, ConfigError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

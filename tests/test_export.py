@@ -1,0 +1,326 @@
+"""Exported files against JAX, and the runner that uses nothing else against the package."""
+
+import dataclasses
+import functools
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import onnx
+import orbax.checkpoint as ocp
+import pytest
+
+from kslc_jax import (
+    checkpoint,
+    curriculum,
+    env,
+    export,
+    networks,
+    observations,
+    physics,
+    randomize,
+    robot,
+    trials,
+)
+from kslc_jax.config import ConfigError, PhysicsConfig, preset, to_dict
+
+RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
+V_MAX, CYCLE = 2.0, 0.55
+ROBOTS = 8
+
+
+@functools.cache
+def make_policy(kind):
+    """Random parameters that stand for a second; the curriculum has moved on from its start.
+
+    symmetric: a mirrored network, the laptop preset's clock and commands. plain: a free network,
+    the paper's clock and commands, arms held.
+    """
+    config, paper = preset("debug"), preset("paper")
+    if kind == "plain":
+        config = dataclasses.replace(
+            config,
+            env=dataclasses.replace(config.env, arms="held"),
+            network=dataclasses.replace(config.network, symmetric=False),
+            gait=paper.gait,
+            command=paper.command,
+        )
+    config = dataclasses.replace(config, physics=PhysicsConfig(engine="mujoco"))
+    params = jax.jit(networks.init, static_argnums=0)(config, jax.random.key(0))
+    bias = jax.random.normal(jax.random.key(1), (32,))  # fresh networks have none
+    params = jax.tree.map(lambda x: x + 0.5 * bias[: x.size] if x.ndim == 1 else x, params)
+    reached = curriculum.init(config).replace(
+        v_max=jnp.asarray(V_MAX), cycle_time=jnp.asarray(CYCLE)
+    )
+    return checkpoint.Policy(config, params, reached, 7)
+
+
+@pytest.fixture(scope="module")
+def symmetric():
+    return make_policy("symmetric")
+
+
+@pytest.fixture(scope="module", params=["symmetric", "plain"])
+def policy(request):
+    return make_policy(request.param)
+
+
+@pytest.fixture(scope="module")
+def onnx_file(policy, tmp_path_factory):
+    path = tmp_path_factory.mktemp("export") / "policy.onnx"
+    path.write_bytes(export.to_onnx(policy))
+    return path
+
+
+@pytest.fixture(scope="module")
+def runner():
+    spec = importlib.util.spec_from_file_location("onnx_runner", RUNNER)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def histories(policy, batch=5):
+    shape = batch, policy.config.env.frames, observations.ACTOR_WIDTH
+    return np.asarray(jax.random.normal(jax.random.key(1), shape))
+
+
+# ------------------------------------------------------------------------------------- the network
+
+
+@pytest.mark.parametrize("form", ["onnx", "stablehlo"])
+def test_the_file_acts_as_the_policy(policy, form, tmp_path):
+    path = tmp_path / "policy"
+    path.write_bytes(export.WRITE[form](policy))
+    network = export.READ[form](path)
+    for batch in (1, 5):
+        seen = histories(policy, batch)
+        wanted = networks.policy(policy.config, policy.params, seen).mean
+        got = network(seen)
+        assert got.shape == (batch, 16) and got.dtype == np.float32
+        np.testing.assert_allclose(got, wanted, atol=2e-6)
+        assert np.abs(wanted).max() > 0.3
+
+
+def test_the_symmetric_actor_as_a_plain_mlp_mirrors(symmetric, tmp_path):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(export.to_onnx(symmetric))
+    network = export.read_onnx(path)
+    permutation, sign = observations.mirror_map(observations.ACTOR)
+    joints, joint_sign = robot.mirror_joints()
+    seen = histories(symmetric)
+    mirrored = (seen[..., permutation] * sign).astype(np.float32)
+    np.testing.assert_allclose(network(mirrored), network(seen)[:, joints] * joint_sign, atol=2e-6)
+
+
+def test_the_graph_is_flatten_gemm_and_elu(onnx_file):
+    model = onnx.load(onnx_file)
+    assert [n.op_type for n in model.graph.node] == ["Flatten", *("Gemm", "Elu") * 2, "Gemm"]
+    (history,), (action,) = model.graph.input, model.graph.output
+    dims = [d.dim_param or d.dim_value for d in history.type.tensor_type.shape.dim]
+    assert dims == ["batch", 3, 59]
+    assert [d.dim_param or d.dim_value for d in action.type.tensor_type.shape.dim] == ["batch", 16]
+    assert model.opset_import[0].version == 17 and model.ir_version == 8
+
+
+def test_metadata(symmetric, xbot):
+    """By literal numbers where the paper or Humanoid-Gym gives them."""
+    data = export.metadata(symmetric)
+    assert data["metadata_version"] == 1 and data["train_step"] == 7
+    assert tuple(data["joint_names"]) == xbot.joint_names
+    assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
+    assert data["effort_limit"][3] == 212.5
+    assert data["speed_limit"] == [12] * 12 + [7] * 4
+    assert data["default_joint_pos"] == [0] * 16 and data["control_dt"] == 0.01
+    assert data["action_scale"] == 0.25 and data["action_clip"] == 18
+    assert data["history_length"] == 3 and data["observation_clip"] == 18
+    assert sum(c["width"] for c in data["frame"]) == 59
+    assert data["frame"][1] == {"name": "command", "width": 3, "scale": (2, 2, 1)}
+    assert data["gait"] == {
+        "cycle_time": pytest.approx(CYCLE),
+        "v_max": V_MAX,
+        "cycle_follows_speed": True,
+        "base_cycle_time": 0.64,
+    }
+    assert data["command"]["stand_still"] and data["held_joints"] == []
+
+
+def test_the_file_holds_the_metadata_as_json(policy, onnx_file):
+    stored = {p.key: json.loads(p.value) for p in onnx.load(onnx_file).metadata_props}
+    assert stored == json.loads(json.dumps(export.metadata(policy)))
+
+
+def test_held_arms_are_named():
+    held = export.metadata(make_policy("plain"))["held_joints"]
+    assert len(held) == 4 and all("shoulder" in name or "elbow" in name for name in held)
+
+
+# ---------------------------------------------------------------------------------- the comparison
+
+
+def test_a_wrong_file_is_found(symmetric, monkeypatch, tmp_path):
+    monkeypatch.setattr(export, "recorded", histories)
+    other = dataclasses.replace(
+        symmetric, params=jax.tree.map(lambda x: x * 1.0001, symmetric.params)
+    )
+    path = tmp_path / "other.onnx"
+    path.write_bytes(export.to_onnx(other))
+    with pytest.raises(ConfigError, match="differs from JAX"):
+        export.compare(symmetric, path, "onnx")
+
+
+def test_without_onnxruntime_it_says_so(policy, onnx_file, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    said = export.compare(policy, onnx_file, "onnx")
+    assert "not compared" in said and "onnxruntime" in said and "pip install" in said
+
+
+# -------------------------------------------------------------------------------- the command line
+
+
+@pytest.fixture(scope="module")
+def saved(symmetric, tmp_path_factory):
+    """A checkpoint folder with what a policy needs and no more."""
+    folder = tmp_path_factory.mktemp("policies") / "saved"
+    reached = {"curriculum/v_max": V_MAX, "curriculum/cycle_time": CYCLE}
+    meta = {"config": to_dict(symmetric.config), "metrics": reached}
+    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
+        items = {"params": ocp.args.StandardSave(symmetric.params), "meta": ocp.args.JsonSave(meta)}
+        writer.save(folder, ocp.args.Composite(**items))
+    return folder
+
+
+def test_command_line(saved, tmp_path, capsys, monkeypatch):
+    seen, recorded = [], export.recorded
+    monkeypatch.setattr(export, "recorded", lambda p: seen.append(recorded(p)) or seen[0])
+    out = tmp_path / "new folder" / "policy.onnx"
+    assert export.main([str(saved), str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "over 1000 recorded observations" in said and str(out) in said
+    assert onnx.load(out).producer_name == "kslc_jax"
+    assert seen[0].shape == (1000, 3, 59)
+    newest = seen[0][:, -1]
+    assert len(np.unique(newest, axis=0)) > 900  # a policy at work, under several commands
+    assert len(np.unique(newest[:, 2])) > 3
+
+
+def test_stablehlo_has_its_metadata_beside_it(saved, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(export, "recorded", histories)
+    out = tmp_path / "policy.bin"
+    assert export.main([str(saved), str(out), "--format", "stablehlo"]) == 0
+    assert "equals JAX within" in capsys.readouterr().out
+    beside = json.loads((tmp_path / "policy.bin.json").read_text())
+    assert beside["gait"]["v_max"] == V_MAX
+
+
+def test_errors_are_one_line(saved, tmp_path, capsys):
+    damaged = tmp_path / "damaged"
+    (damaged / "params").mkdir(parents=True)
+    a_file = tmp_path / "file"
+    a_file.touch()
+    for policy, out, says in (
+        (saved, "policy.pt", "neither .onnx nor .stablehlo"),
+        ("no-such-policy", "policy.onnx", "no run, checkpoint or shipped policy"),
+        (damaged, tmp_path / "policy.onnx", "no readable checkpoint"),
+        (saved, a_file / "policy.onnx", str(a_file)),
+        (saved, tmp_path, "neither .onnx nor .stablehlo"),
+    ):
+        assert export.main([str(policy), str(out)]) == 2
+        err = capsys.readouterr().err.strip().splitlines()
+        assert len(err) == 1 and err[0].startswith("error: ") and says in err[0], err
+
+
+def test_onnx_missing_is_one_line(saved, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert export.main([str(saved), str(tmp_path / "policy.onnx")]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1 and "pip install 'kslc_jax[export]'" in err[0]
+
+
+# ---------------------------------------------------------------------------------------- runner
+
+
+@pytest.fixture(scope="module")
+def trajectory(policy):
+    """Environments from the default pose under their own commands, 101 states."""
+    config = trials.trial_config(policy.config, trials.Setting(policy.config.physics), ROBOTS)
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, reset_joint_noise=0.0))
+
+    def run(key):
+        reset = jax.vmap(lambda k: env.reset(config, k, policy.curriculum))
+        return jax.lax.scan(one, reset(jax.random.split(key, ROBOTS)), None, length=101)[1]
+
+    def one(states, _):
+        def step(state):
+            action, key = policy.act_on(state.history), jax.random.key(0)
+            return env.step(config, state, action, key, policy.curriculum)[0]
+
+        return jax.vmap(step)(states), states
+
+    return jax.tree.map(np.asarray, jax.jit(run)(jax.random.key(3)))
+
+
+def controller_of(runner, path, states, i):
+    """A runner that starts where environment `i` starts."""
+    command = states.command
+    vx, vy, _ = command.velocity[0, i].tolist()
+    controller = runner.Controller(path, vx, vy, command.heading[0, i])
+    controller.phase = float(states.gait.phase[0, i])
+    return controller
+
+
+def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajectory):
+    """The one place that builds observations a second time: all frames of a second."""
+    qpos, qvel = trajectory.physics.qpos, trajectory.physics.qvel
+    assert (trajectory.time == np.arange(len(qpos))[:, None]).all()  # nobody has fallen
+    assert trajectory.command.moving.all() != policy.config.command.stand_still
+    for i in range(ROBOTS):
+        controller = controller_of(runner, onnx_file, trajectory, i)
+        for q, v, history in zip(qpos[:, i], qvel[:, i], trajectory.history[:, i], strict=True):
+            controller.targets(q[3:7], v[3:6], q[7:], v[6:])
+            np.testing.assert_allclose(controller.history, history, atol=1e-5)
+
+
+def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
+    """Servo solve, torques, decimation and actions: 0.8 s of the robot, by itself."""
+    steps = 80
+    model = mujoco.MjModel.from_xml_path(str(robot.MODEL_PATH))
+    for i in range(ROBOTS):
+        controller = controller_of(runner, onnx_file, trajectory, i)
+        track = runner.simulate(controller, model, 0.01 * steps)
+        wanted = trajectory.physics.qpos[: steps + 1, i, :3]
+        np.testing.assert_allclose(track, wanted, atol=1e-4)
+
+
+def test_motor_torque_is_the_packages(runner, symmetric, xbot):
+    rng = np.random.default_rng(0)
+    q, target = rng.uniform(-1, 1, (2, 200, 16))
+    dq = rng.uniform(-20, 20, (200, 16))
+    one = jax.tree.map(np.asarray, randomize.nominal())
+    meta = runner.SimpleNamespace(**export.metadata(symmetric))
+    np.testing.assert_allclose(
+        runner.motor_torque(meta, target, q, dq),
+        physics.motor_torque(xbot, one, q, dq, target, np),
+        atol=1e-9,
+    )
+
+
+def test_the_runner_alone(onnx_file, tmp_path):
+    """In a process of its own, far from the repository, without JAX and kslc_jax."""
+    check = (
+        "import runpy, sys; sys.argv = sys.argv[1:];"
+        "runpy.run_path(sys.argv[0], run_name='__main__');"
+        "assert not {'jax', 'kslc_jax', 'flax', 'onnx'} & set(sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", check, str(RUNNER), str(onnx_file), "--seconds", "4"],
+        capture_output=True, text=True, cwd=tmp_path, check=False, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "mean forward speed" in done.stdout and "fell after" in done.stdout

@@ -1,0 +1,100 @@
+"""Actor and critic: what mirroring does to them, and how they start."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from kslc_jax import networks, observations, robot
+from kslc_jax.config import ConfigError, NetworkConfig, preset
+
+CONFIG = preset("debug")
+KEY = jax.random.key(3)
+
+
+def perturbed(config):
+    """Parameters with nothing at its special initial value."""
+    params = networks.init(config, KEY)
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(KEY, len(leaves))
+    return jax.tree.unflatten(
+        tree, [x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    )
+
+
+def mirrored(table, frames):
+    permutation, sign = observations.mirror_map(table)
+    return frames[..., permutation] * sign
+
+
+@pytest.mark.parametrize(
+    "mirror",
+    [
+        observations.mirror_map(observations.ACTOR),
+        observations.mirror_map(observations.CRITIC),
+        robot.mirror_joints(),
+        (np.array([2, 1, 0, 3]), np.array([1.0, 1.0, 1.0, -1.0])),
+    ],
+)
+def test_parity_splits_every_vector(mirror):
+    permutation, sign = mirror
+    p = networks.parity(permutation, sign)
+    basis = np.concatenate([p.even, p.odd], axis=1)
+    np.testing.assert_allclose(basis.T @ basis, np.eye(len(sign)), atol=1e-6)
+    np.testing.assert_allclose(p.even[permutation] * sign[:, None], p.even, atol=1e-6)
+    np.testing.assert_allclose(p.odd[permutation] * sign[:, None], -p.odd, atol=1e-6)
+
+
+def test_value_of_a_mirrored_robot_is_the_same():
+    params = perturbed(CONFIG)
+    frames = jax.random.normal(KEY, (5, CONFIG.env.privileged_frames, observations.CRITIC_WIDTH))
+    here = networks.value(CONFIG, params, frames)
+    there = networks.value(CONFIG, params, mirrored(observations.CRITIC, frames))
+    np.testing.assert_allclose(here, there, rtol=1e-4, atol=1e-5)
+    assert np.std(here) > 0.1
+
+
+def test_action_of_a_mirrored_robot_is_mirrored_for_any_weights():
+    params = perturbed(CONFIG)
+    history = jax.random.normal(KEY, (5, CONFIG.env.frames, observations.ACTOR_WIDTH))
+    here = networks.policy(CONFIG, params, history).mean
+    there = networks.policy(CONFIG, params, mirrored(observations.ACTOR, history)).mean
+    joints, sign = robot.mirror_joints()
+    np.testing.assert_allclose(there, here[:, joints] * sign, rtol=1e-4, atol=1e-5)
+    assert np.std(here) > 0.1
+
+
+def test_symmetric_networks_have_half_the_weights():
+    def size(config):
+        actor = networks.init(config, KEY)["actor"]
+        return sum(x.size for x in jax.tree.leaves(actor) if x.ndim == 2)
+
+    free = dataclasses.replace(CONFIG.network, symmetric=False)
+    assert size(CONFIG) / size(dataclasses.replace(CONFIG, network=free)) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_init_mean_scales_the_first_actions(symmetric):
+    history = jax.random.normal(KEY, (64, CONFIG.env.frames, observations.ACTOR_WIDTH))
+
+    def size(init_mean):
+        network = dataclasses.replace(CONFIG.network, symmetric=symmetric, init_mean=init_mean)
+        config = dataclasses.replace(CONFIG, network=network)
+        return np.std(networks.policy(config, networks.init(config, KEY), history).mean)
+
+    assert size(0.01) == pytest.approx(0.01 * size(1.0), rel=1e-3)
+    assert 0.1 < size(1.0) < 2.0
+
+
+def test_pairs_need_even_sizes():
+    with pytest.raises(ConfigError, match=r"must be even with network\.symmetric"):
+        NetworkConfig(actor=(32, 15), symmetric=True)
+
+
+def test_networks_have_the_papers_sizes():
+    config = preset("paper")
+    params = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
+    shapes = lambda net: [params[net][f"Dense_{i}"]["kernel"].shape for i in range(4)]  # noqa: E731
+    assert shapes("actor") == [(15 * 59, 512), (512, 256), (256, 128), (128, 16)]
+    assert shapes("critic") == [(3 * 89, 768), (768, 256), (256, 128), (128, 1)]
