@@ -16,7 +16,7 @@ class Curriculum:
     tracking: jax.Array  # [] moving average of the tracking reward over its maximum
     fast_tracking: jax.Array  # [] the same over the commands in the top part of the range
     episode_steps: jax.Array  # [] moving average length of finished episodes
-    gait: jax.Array  # [] moving average of how well the feet follow the clock, -0.3 to 1
+    gait: jax.Array  # [] moving average of how well feet follow the clock at speed, -0.3 to 1
     updates: jax.Array  # [] int, updates since the last change
 
 
@@ -30,7 +30,7 @@ class Progress:
     fast_count: jax.Array  # [] number of those samples
     episode_steps: jax.Array  # [] mean length of the episodes that ended
     episode_count: jax.Array  # [] number of those
-    gait: jax.Array  # [] mean of the feet_contact_number term
+    gait: jax.Array  # [] mean of the feet_contact_number term over the fast commands' samples
 
 
 def init(config: Config) -> Curriculum:
@@ -55,7 +55,7 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
     """Averages `progress` in and, where the gate opens, widens the range and shortens the cycle.
 
     The gate: all and fast tracking above their thresholds, long episodes, feet that follow the
-    clock, some updates since the last change. A widened range starts with an empty average of the
+    clock, some updates since the last change. A widened range starts with empty averages of the
     fast commands.
     """
 
@@ -66,7 +66,7 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
     tracking = average(state.tracking, progress.tracking, progress.tracking_count)
     fast = average(state.fast_tracking, progress.fast_tracking, progress.fast_count)
     steps = average(state.episode_steps, progress.episode_steps, progress.episode_count)
-    gait = average(state.gait, progress.gait, jnp.ones(()))
+    gait = average(state.gait, progress.gait, progress.fast_count)
     updates = state.updates + 1
     v_max = jnp.minimum(state.v_max + config.v_step, config.v_limit)
     cycle = jnp.maximum(state.cycle_time * config.cycle_factor, config.cycle_min)
@@ -86,6 +86,6 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
         tracking=tracking,
         fast_tracking=jnp.where(gate, 0.0, fast),
         episode_steps=steps,
-        gait=gait,
+        gait=jnp.where(gate, 0.0, gait),
         updates=jnp.where(gate, 0, updates),
     )

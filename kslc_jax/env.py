@@ -99,7 +99,8 @@ def step(
     keys = jax.random.split(key, 5)
     robot = physics.robot_for(config.physics)
 
-    action = _applied_action(config, action, state.last_action, keys[0])
+    noise = state.dynamics.noise
+    action = _applied_action(config, action, state.last_action, noise, keys[0])
     target = jnp.asarray(robot.default_qpos[7:], jnp.float32) + config.env.action_scale * action
     new = physics.step(
         config.physics, state.physics, target, state.dynamics, config.randomize.ground_friction
@@ -161,15 +162,16 @@ def step(
 
 
 def _applied_action(
-    config: Config, action: jax.Array, last_action: jax.Array, key: jax.Array
+    config: Config, action: jax.Array, last_action: jax.Array, noise: jax.Array, key: jax.Array
 ) -> jax.Array:
-    """Clipped action after a random delay and multiplicative noise (HG); arms zeroed if held."""
+    """Clipped action after a random delay and multiplicative noise (HG), both scaled by the
+    episode's `noise` []; arms zeroed if held."""
     key_delay, key_noise = jax.random.split(key)
     action = jnp.clip(action, -config.env.action_clip, config.env.action_clip)
-    delay = config.env.action_delay * jax.random.uniform(key_delay)
+    delay = noise * config.env.action_delay * jax.random.uniform(key_delay)
     action = (1.0 - delay) * action + delay * last_action
-    noise = jax.random.normal(key_noise, action.shape)
-    action = action * (1.0 + config.env.action_noise * noise)
+    spread = noise * config.env.action_noise
+    action = action * (1.0 + spread * jax.random.normal(key_noise, action.shape))
     if config.env.arms == "held":
         action = action * ~physics.robot_for(config.physics).is_arm
     return action

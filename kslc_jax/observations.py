@@ -132,7 +132,8 @@ def _frame(table: tuple[Component, ...], src: Sources) -> jax.Array:
 def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
     """Noisy actor frame [59]; noise is scaled with its component, as in HG."""
     frame = _frame(ACTOR, src)
-    scale = config.noise_level * _row(ACTOR, "noise") * _row(ACTOR, "scale")
+    level = config.noise_level * src.dynamics.noise
+    scale = level * _row(ACTOR, "noise") * _row(ACTOR, "scale")
     frame = frame + scale * jax.random.normal(key, frame.shape)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 

@@ -19,6 +19,7 @@ class Dynamics:
     kd: jax.Array  # [16] factor on the velocity gain
     motor_strength: jax.Array  # [16] factor on the available torque
     joint_friction: jax.Array  # [16] N m
+    noise: jax.Array  # [] factor on sensor noise, action noise and action delay
 
 
 def nominal(friction: float = 1.0) -> Dynamics:
@@ -31,12 +32,13 @@ def nominal(friction: float = 1.0) -> Dynamics:
         kd=jnp.ones(NUM_JOINTS),
         motor_strength=jnp.ones(NUM_JOINTS),
         joint_friction=jnp.zeros(NUM_JOINTS),
+        noise=jnp.ones(()),
     )
 
 
 def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
     """Draws the parameters of one episode, each uniform in its configured range."""
-    keys = jax.random.split(key, 7)
+    keys = jax.random.split(key, 8)
 
     def uniform(key: jax.Array, bounds: Range, shape: tuple[int, ...] = ()) -> jax.Array:
         return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
@@ -49,6 +51,7 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
         kd=uniform(keys[4], config.kd, (NUM_JOINTS,)),
         motor_strength=uniform(keys[5], config.motor_strength, (NUM_JOINTS,)),
         joint_friction=uniform(keys[6], config.joint_friction, (NUM_JOINTS,)),
+        noise=uniform(keys[7], config.noise),
     )
 
 

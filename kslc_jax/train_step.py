@@ -183,7 +183,7 @@ def _progress(out: Outcome) -> Progress:
     tracking, tracking_count = mean_over(out.tracking, out.settled)
     fast_tracking, fast_count = mean_over(out.tracking, out.fast)
     episode_steps, episode_count = mean_over(out.episode_steps, done)
-    gait, _ = mean_over(out.terms["feet_contact_number"], ~out.broken)
+    gait, _ = mean_over(out.terms["feet_contact_number"], out.fast)
     return Progress(
         tracking, tracking_count, fast_tracking, fast_count, episode_steps, episode_count, gait
     )

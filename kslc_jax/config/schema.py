@@ -194,6 +194,8 @@ class RandomizeConfig:
     """Factor on the available torque, per joint."""
     joint_friction: Range = (0.0, 0.0)
     """Coulomb friction of the joints [N m]."""
+    noise: Range = (1.0, 1.0)
+    """Factor on sensor noise, action noise and action delay of an episode."""
     push_seconds: float = 4.0
     """Time between pushes; 0: none (HG)."""
     push_velocity: float = 0.2
@@ -210,7 +212,7 @@ class RandomizeConfig:
             if isinstance(value, tuple):
                 _check_range(f"randomize.{f.name}", value)
         require(self.base_mass[0] > -20, "randomize.base_mass: the base link has 21 kg to lose")
-        for name in ("kp", "kd", "motor_strength", "friction", "joint_friction"):
+        for name in ("kp", "kd", "motor_strength", "friction", "joint_friction", "noise"):
             require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
 
 
@@ -327,8 +329,8 @@ class CurriculumConfig:
     """Share of the maximal tracking reward that the fast commands must reach."""
     min_episode_steps: float = 1000.0
     gait_threshold: float = -1.0
-    """Least mean of the `feet_contact_number` term, which is 1 where the feet follow the clock and
-    -0.3 where they do the contrary; -1: any. A shuffle can track, too."""
+    """Least mean of the `feet_contact_number` term under fast commands, which is 1 where the feet
+    follow the clock and -0.3 where they do the contrary; -1: any. A shuffle can track, too."""
     settle_seconds: float = 0.0
     """Tracking counts from this long after a change of the command: reaching it takes time, and the
     longer the wider the range is."""

@@ -14,6 +14,7 @@ YOUNGER = {
     "config.gait.double_support_at_speed",
     "config.rewards.weights.tracking_mean_vel",
     "config.curriculum.gait_threshold",
+    "config.randomize.noise",
     "config.rewards.exact_from",
     "config.rewards.exact_full",
 }
