@@ -3,7 +3,9 @@
 Writes the network `history [batch, K, 59] -> action [batch, 16]` together with everything that a
 robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. OUT ends in
 .onnx or .stablehlo (read back by jax.export; the data go beside it in OUT.json). The file is then
-compared with JAX over observations of the policy at work. See docs/export.md.
+compared with JAX over observations of the policy at work. With --format orbax OUT is a folder that
+`kslc_jax.load_policy` reads: config and actor-critic parameters, without the rest of a checkpoint.
+See docs/export.md.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
     from kslc_jax.checkpoint import Policy
     from kslc_jax.networks import Params, Parity
 
-Format = Literal["onnx", "stablehlo"]
+Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
 """Histories [B, K, 59] to actions [B, 16]."""
 
@@ -51,9 +53,9 @@ class Args:
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
     out: tyro.conf.Positional[Path]
-    """File to write, .onnx or .stablehlo."""
+    """File to write, .onnx or .stablehlo, or folder."""
     format: Format | None = None
-    """Needed only where OUT's suffix does not say it."""
+    """Needed only where OUT's suffix does not say it: for orbax, always."""
 
     def __post_init__(self):
         if self.chosen not in get_args(Format):
@@ -216,10 +218,23 @@ def read_stablehlo(path: Path) -> Network:
     return lambda histories: np.asarray(exported.call(histories))
 
 
+# ------------------------------------------------------------------------------------------ orbax
+
+
+def read_orbax(path: Path) -> Network:
+    """The network of a policy folder."""
+    import jax
+
+    from kslc_jax.checkpoint import load_policy
+
+    act = jax.jit(jax.vmap(load_policy(path).act_on))
+    return lambda histories: np.asarray(act(histories))
+
+
 # ------------------------------------------------------------------------------------- comparison
 
 WRITE = {"onnx": to_onnx, "stablehlo": to_stablehlo}
-READ = {"onnx": read_onnx, "stablehlo": read_stablehlo}
+READ = {"onnx": read_onnx, "stablehlo": read_stablehlo, "orbax": read_orbax}
 
 
 def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
@@ -279,14 +294,17 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
-        from kslc_jax.checkpoint import CheckpointError, load_policy
+        from kslc_jax.checkpoint import CheckpointError, load_policy, save_policy
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
         policy = load_policy(args.policy)
         args.out.parent.mkdir(parents=True, exist_ok=True)
-        args.out.write_bytes(WRITE[args.chosen](policy))
+        if args.chosen == "orbax":
+            save_policy(policy, args.out)
+        else:
+            args.out.write_bytes(WRITE[args.chosen](policy))
         if args.chosen == "stablehlo":
             beside = args.out.with_name(args.out.name + ".json")
             beside.write_text(json.dumps(metadata(policy), indent=1))

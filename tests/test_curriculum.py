@@ -23,9 +23,9 @@ def state(**changes) -> Curriculum:
 
 
 def progress(
-    tracking=0.85, fast=0.75, fast_count=10, steps=1500.0, count=5, settled=100
+    tracking=0.85, fast=0.75, fast_count=10, steps=1500.0, count=5, settled=100, gait=0.7
 ) -> Progress:
-    values = (tracking, settled, fast, fast_count, steps, count)
+    values = (tracking, settled, fast, fast_count, steps, count, gait)
     return Progress(*(jnp.asarray(v, jnp.float32) for v in values))
 
 
@@ -52,6 +52,15 @@ def test_averages_by_hand():
     assert float(two.fast_tracking) == pytest.approx(0.049)  # 0.019 + 0.03
     assert float(two.episode_steps) == pytest.approx(29.5)  # 9.5 + 20
     assert int(two.updates) == 2
+
+
+def test_a_shuffle_does_not_open_the_gate():
+    strict = dataclasses.replace(DIRECT, gait_threshold=0.65)
+    for gait, opens in ((0.64, False), (0.66, True)):
+        new = curriculum.update(strict, state(**READY), progress(gait=gait))
+        assert (float(new.v_max) > 0.5) == opens
+        assert float(new.gait) == pytest.approx(gait)
+    assert float(curriculum.update(DIRECT, state(**READY), progress(gait=-0.3)).v_max) == 1.0
 
 
 def test_averages_skip_what_was_not_seen():

@@ -84,8 +84,13 @@ def test_action_becomes_the_joint_target(setting):
 def test_delay_and_noise(debug):
     """(1 - d) a + d a_prev with d <= 0.5, times 1 + 0.02 n; clipped at 18 before."""
     keys = jax.random.split(jax.random.key(0), 4000)
-    apply = jax.vmap(lambda k: env._applied_action(debug, jnp.full(16, 30.0), jnp.zeros(16), k))
-    applied = apply(keys)
+
+    def apply(noise):
+        one = lambda k: env._applied_action(debug, jnp.full(16, 30.0), jnp.zeros(16), noise, k)  # noqa: E731
+        return jax.vmap(one)(keys)
+
+    np.testing.assert_array_equal(apply(0.0), 18.0)
+    applied = apply(1.0)
     assert float(applied.max()) < 18.0 * 1.1
     per_env = applied.mean(axis=1)  # noise averages out over joints, the delay is per environment
     assert per_env.min() == pytest.approx(9.0, abs=0.4)
@@ -95,7 +100,7 @@ def test_delay_and_noise(debug):
 
 def test_held_arms_ignore_actions(debug):
     held = dataclasses.replace(debug, env=dataclasses.replace(debug.env, arms="held"))
-    applied = env._applied_action(held, jnp.ones(16), jnp.ones(16), jax.random.key(0))
+    applied = env._applied_action(held, jnp.ones(16), jnp.ones(16), 1.0, jax.random.key(0))
     assert not np.any(applied[12:]) and np.all(applied[:12])
 
 

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import onnx
-import orbax.checkpoint as ocp
 import pytest
 
 from kslc_jax import (
@@ -28,7 +27,7 @@ from kslc_jax import (
     robot,
     trials,
 )
-from kslc_jax.config import ConfigError, PhysicsConfig, preset, to_dict
+from kslc_jax.config import ConfigError, PhysicsConfig, preset
 
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
@@ -186,14 +185,26 @@ def test_without_onnxruntime_it_says_so(policy, onnx_file, monkeypatch):
 
 @pytest.fixture(scope="module")
 def saved(symmetric, tmp_path_factory):
-    """A checkpoint folder with what a policy needs and no more."""
     folder = tmp_path_factory.mktemp("policies") / "saved"
-    reached = {"curriculum/v_max": V_MAX, "curriculum/cycle_time": CYCLE}
-    meta = {"config": to_dict(symmetric.config), "metrics": reached}
-    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
-        items = {"params": ocp.args.StandardSave(symmetric.params), "meta": ocp.args.JsonSave(meta)}
-        writer.save(folder, ocp.args.Composite(**items))
+    checkpoint.save_policy(symmetric, folder)
     return folder
+
+
+def test_a_policy_folder_is_the_whole_policy(symmetric, saved):
+    back = checkpoint.load_policy(saved)
+    assert back.config == symmetric.config and back.step == symmetric.step
+    jax.tree.map(np.testing.assert_array_equal, back.params, symmetric.params)
+    jax.tree.map(np.testing.assert_array_equal, back.curriculum, symmetric.curriculum)
+    with pytest.raises(checkpoint.CheckpointError, match="cannot write"):
+        checkpoint.save_policy(symmetric, saved)
+
+
+def test_orbax_has_to_be_asked_for(saved, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(export, "recorded", histories)
+    out = tmp_path / "mine"
+    assert export.main([str(saved), str(out), "--format", "orbax"]) == 0
+    assert "equals JAX within 0.0e+00" in capsys.readouterr().out
+    assert sorted(p.name for p in out.iterdir() if p.is_dir()) == ["meta", "params"]
 
 
 def test_command_line(saved, tmp_path, capsys, monkeypatch):

@@ -203,6 +203,19 @@ def test_noise_level_scales_all_of_it():
     assert float(jnp.max(jnp.abs(one))) > 0.01
 
 
+def test_noise_factor_of_the_episode_scales_it_too():
+    key, dynamics = jax.random.key(1), randomize.nominal(friction=1.3)
+    none, half = (
+        observations.actor_frame(
+            EnvConfig(noise_level=1.0), make_sources(dynamics=dynamics.replace(noise=x)), key
+        )
+        for x in (0.0, 0.5)
+    )
+    level = observations.actor_frame(EnvConfig(noise_level=0.5), make_sources(), key)
+    np.testing.assert_array_equal(half, level)
+    np.testing.assert_allclose(none, ACTOR_FRAME, atol=1e-6)
+
+
 # ----------------------------------------------------------------------------------------- history
 
 

@@ -236,13 +236,16 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("low_speed", KSLC, {"vx": -0.3, "base_linvel": [-0.1, 0, 0]}, -1.0),
     ("low_speed", KSLC, {"vx": 0.05, "base_linvel": [-1.0, 0, 0]}, 0.0),
     ("low_speed", KSLC, {"velocity": [0.0, 0.3, 0.0], "base_linvel": [1.0, 0, 0]}, 0.0),
-    # The mean velocity counts, not today's: |(0.06, -0.08)| = 0.1: e^-1.
+    # The mean velocity counts, not the present one: |(0.06, -0.08)| = 0.1: e^-1.
     (
         "tracking_mean_vel",
         KSLC,
         {"velocity": [1.0, 0, 0.5], "mean_velocity": [1.06, -0.08], "base_linvel": [9, 9, 9]},
         0.36787944,
     ),
+    # Half way from 0.5 to 2.5 m/s: half; nothing at the start of the curriculum.
+    ("tracking_mean_vel", KSLC, {"v_max": 1.5}, 0.5),
+    ("tracking_mean_vel", KSLC, {"v_max": 0.5}, 0.0),
     # e_xy = 0.5, e_yaw = 0.2: (e^-5 + e^-2) / 2 - 0.2 * 0.7 = 0.0710366 - 0.14.
     (
         "track_vel_hard",

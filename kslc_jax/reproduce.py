@@ -1,0 +1,168 @@
+"""Do this machine's numbers agree with the published ones? python -m kslc_jax.reproduce [POLICY]
+
+Evaluates a shipped policy again, under the conditions of its stored evaluation, and compares each
+number with its band. With --train it trains the policy's preset from scratch as well and compares
+when the range of commanded speeds grew. Exit code 1 where a number lies outside its band.
+
+Examples:
+  python -m kslc_jax.reproduce                   # minutes
+  python -m kslc_jax.reproduce --train --seed 1  # an hour on two CPU cores
+"""
+
+import dataclasses
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from kslc_jax import evaluate, runtime
+from kslc_jax.config import Config, ConfigError
+
+SHIPPED = "xbot_l_run"
+EVALUATION = "evaluation.json"
+MILESTONES = "milestones.json"
+
+BANDS = {
+    "survival": 0.15,
+    "forward_mean": 0.05,
+    "forward_std": 0.03,
+    "lateral_std": 0.03,
+    "yaw_rate_std": 0.05,
+    "stride_frequency": 0.1,
+    "flight_share": 0.05,
+    "shoulder_hip_correlation": 0.1,
+}
+"""How far a metric may be from its stored value, in its own unit."""
+
+LATER = 1.5
+"""A milestone may need this many times the stored environment steps: seeds differ by as much."""
+
+Row = tuple[str, float, float, bool]
+"""(what, stored, found, agrees)"""
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to repeat."""
+
+    policy: tyro.conf.Positional[str] = SHIPPED
+    """Name of a shipped policy."""
+    train: bool = False
+    """Train from scratch too."""
+    seed: int = 0
+    """Of the training."""
+    run_dir: Path = Path("runs/reproduce")
+    """Where the training goes."""
+
+
+def stored(folder: Path, name: str) -> dict[str, Any]:
+    """A JSON file of a shipped policy; ConfigError if it has none."""
+    try:
+        return json.loads((folder / name).read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{folder} holds no readable {name}: nothing to compare with") from error
+
+
+def compare_rows(old: list[dict[str, float]], new: list[dict[str, float]]) -> list[Row]:
+    """Every banded metric of every commanded speed."""
+    out = []
+    for before, now in zip(old, new, strict=True):
+        for name in (n for n in BANDS if n in before):
+            found = now.get(name, float("nan"))
+            agrees = abs(found - before[name]) <= BANDS[name]
+            out.append((f"{name} at {before['command']:g} m/s", before[name], found, agrees))
+    return out
+
+
+def compare_milestones(old: dict[str, float], new: dict[str, float]) -> list[Row]:
+    """Millions of environment steps until commands reached each speed."""
+    out = []
+    for speed, steps in old.items():
+        found = new.get(speed, float("inf"))
+        row = f"commands up to {speed} m/s, M steps"
+        out.append((row, steps / 1e6, found / 1e6, found <= LATER * steps))
+    return out
+
+
+def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
+    """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
+    those at which each speed [m/s] was reached."""
+    from kslc_jax import plots, runner
+    from kslc_jax.logs import Progress
+
+    run = dataclasses.replace(config.run, steps=round(until))
+    config = dataclasses.replace(config, seed=args.seed, run=run)
+    going_on = (args.run_dir / "checkpoints").is_dir()
+    runner.train(config, args.run_dir, going_on, Progress(config))
+    records = plots.read_metrics(args.run_dir)
+    return {f"{speed:g}": steps for speed, steps, _ in plots.milestones(records)}
+
+
+def report(rows: list[Row], title: str):
+    """What was compared, as a rich table."""
+    from rich.table import Table
+
+    out = Table(title=title, title_justify="left")
+    for column in ("what", "published", "here", ""):
+        out.add_column(column, justify="left" if column == "what" else "right")
+    for what, before, now, agrees in rows:
+        out.add_row(what, f"{before:.3f}", f"{now:.3f}", "ok" if agrees else "[red]differs")
+    return out
+
+
+def repeat(args: Args) -> list[Row]:
+    """Everything that was asked for; ConfigError, CheckpointError or RunError where it cannot."""
+    from rich.progress import Progress
+
+    from kslc_jax.checkpoint import POLICIES, load_policy
+
+    policy = load_policy(args.policy)
+    folder = POLICIES / args.policy
+    old = stored(folder, EVALUATION)
+    how = evaluate.Args(
+        Path(args.policy),
+        speeds=tuple(row["command"] for row in old["rows"]),
+        seeds=old["seeds"],
+        seconds=old["seconds"],
+        fidelity=old["fidelity"],
+    )
+    screen = evaluate.console()
+    with Progress(console=screen, transient=True) as bar:
+        task = bar.add_task("trying", total=1.0)
+        new = evaluate.sweep(how, policy, lambda share: bar.update(task, completed=share))
+    rows = compare_rows(old["rows"], new)
+    screen.print(report(rows, f"{args.policy}: evaluation"))
+    if args.train:
+        milestones = stored(folder, MILESTONES)
+        found = retrain(args, policy.config, LATER * max(milestones.values()))
+        trained = compare_milestones(milestones, found)
+        screen.print(report(trained, f"{args.policy}: training, at most {LATER:g} times as long"))
+        rows += trained
+    return rows
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    runtime.prepare()
+    args = tyro.cli(Args, args=argv, description=__doc__)
+    from kslc_jax.checkpoint import CheckpointError
+    from kslc_jax.runner import RunError
+
+    try:
+        rows = repeat(args)
+    except (CheckpointError, ConfigError, RunError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    differing = [what for what, _, _, agrees in rows if not agrees]
+    if differing:
+        print(f"{len(differing)} of {len(rows)} numbers lie outside their band")
+        return 1
+    print(f"all {len(rows)} numbers lie within their bands")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

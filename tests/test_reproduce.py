@@ -1,0 +1,77 @@
+"""Published numbers against new ones: bands, milestones, and what is said where there are none."""
+
+import json
+import math
+
+import jax
+import numpy as np
+import pytest
+
+from kslc_jax import checkpoint, curriculum, networks, reproduce
+from kslc_jax.config import preset
+
+
+@pytest.fixture
+def shipped(tmp_path, monkeypatch):
+    """A policy that asks for the default pose, among the shipped ones; it falls at once."""
+    config = preset("debug")
+    params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
+    policy = checkpoint.Policy(config, params, curriculum.init(config), 7)
+    monkeypatch.setattr(checkpoint, "POLICIES", tmp_path)
+    checkpoint.save_policy(policy, tmp_path / "still")
+    return tmp_path / "still"
+
+
+def evaluation(survival, fidelity="train"):
+    rows = [{"command": 1.0, "survival": survival, "forward_mean": 0.0}]
+    return json.dumps({"seeds": 2, "seconds": 3.0, "fidelity": fidelity, "rows": rows})
+
+
+def test_bands():
+    old = [{"command": 1.0, "survival": 1.0, "forward_mean": 0.98, "cost_of_transport": 1.0}]
+    new = [{"command": 1.0, "survival": 1.0, "forward_mean": 0.92, "cost_of_transport": 9.0}]
+    assert reproduce.compare_rows(old, new) == [
+        ("survival at 1 m/s", 1.0, 1.0, True),
+        ("forward_mean at 1 m/s", 0.98, 0.92, False),  # 0.06 off, 0.05 allowed; CoT has no band
+    ]
+    missing = reproduce.compare_rows(old, [{"command": 1.0, "survival": 0.0}])
+    assert not any(agrees for *_, agrees in missing)
+
+
+def test_milestones_may_be_half_as_late_again():
+    old = {"1": 10e6, "1.5": 12e6, "2": 15e6}
+    rows = reproduce.compare_milestones(old, {"1": 14.9e6, "1.5": 18.1e6})
+    assert [agrees for *_, agrees in rows] == [True, False, False]
+    assert math.isinf(rows[2][2])
+
+
+@pytest.mark.parametrize(("survival", "code"), [(0.0, 0), (1.0, 1)])
+def test_a_shipped_policy_is_tried_again(shipped, survival, code, capsys):
+    (shipped / reproduce.EVALUATION).write_text(evaluation(survival))
+    assert reproduce.main(["still"]) == code
+    said = capsys.readouterr().out
+    assert ("lie outside their band" if code else "all 2 numbers lie within") in said
+
+
+def test_nothing_to_compare_with_is_one_line(shipped, capsys):
+    for argv, says in (
+        (["still"], "no readable evaluation.json"),
+        (["none"], "no run, checkpoint"),
+    ):
+        assert reproduce.main(argv) == 2
+        err = capsys.readouterr().err.strip().splitlines()
+        assert len(err) == 1 and err[0].startswith("error: ") and says in err[0]
+
+
+def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
+    (shipped / reproduce.EVALUATION).write_text(evaluation(0.0))
+    (shipped / reproduce.MILESTONES).write_text(json.dumps({"1": 2000}))
+    asked = []
+
+    def fake(args, config, until):
+        asked.append(until)
+        return {"1": 2500.0}
+
+    monkeypatch.setattr(reproduce, "retrain", fake)
+    assert reproduce.main(["still", "--train", "--run-dir", str(tmp_path / "run")]) == 0
+    assert asked == [3000.0]
