@@ -59,8 +59,8 @@ class Controller:
         """Joint targets [rad] until the next control step; advances clock and history."""
         m, gait = self.meta, self.meta.gait
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
-        (action,) = self.network.run(["action"], {"history": self.history[None]})
-        self.action = np.clip(action[0], -m.action_clip, m.action_clip) * self.free
+        action = np.asarray(self.network.run(["action"], {"history": self.history[None]}))[0, 0]
+        self.action = np.clip(action, -m.action_clip, m.action_clip) * self.free
         share = min(abs(self.velocity[0]) / gait["v_max"], 1.0)
         share = share if gait["cycle_follows_speed"] else 1.0
         cycle = gait["base_cycle_time"] + share * (gait["cycle_time"] - gait["base_cycle_time"])

@@ -5,10 +5,15 @@ A checkpoint holds four orbax items, each usable without the others:
 - ``params``  the networks, all that a policy needs;
 - ``core``    optimiser, learning rate, curriculum, key and step;
 - ``env``     the environments; with it a resumed run equals an uninterrupted one bit for bit;
-- ``meta``    JSON: schema version, config, metrics of that step.
+- ``meta``    JSON: schema version, config, metrics of that step, checksums.
+
+Nothing is ever unpickled: arrays are raw numbers, everything else is JSON.
 """
 
-from collections.abc import Callable
+import contextlib
+import json
+import zlib
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,13 +27,16 @@ import orbax.checkpoint as ocp
 from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import networks, observations
-from kslc_jax.config import Config, ConfigError
+from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.train_step import TrainState
 
 FOLDER = "checkpoints"
 POLICIES = Path(__file__).parent / "policies"
 BEST_METRIC = "score"
+
+SCHEMA_VERSION = 1
+"""Of a checkpoint's items; raise it when an older kslc_jax could not read what this one writes."""
 
 
 class CheckpointError(RuntimeError):
@@ -38,6 +46,51 @@ class CheckpointError(RuntimeError):
 def first_line(error: Exception) -> str:
     """The first line of an error's message, cut to what fits a terminal."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+def host_array(x: jax.Array) -> np.ndarray:
+    """An array's numbers on the host; those of a typed key are its key data."""
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    return np.asarray(jax.random.key_data(x) if is_key else x)
+
+
+def checksum(tree: Any) -> int:
+    """CRC-32 of all numbers of a tree: orbax itself reads flipped bits without a word."""
+    crc = 0
+    for leaf in jax.tree.leaves(tree):
+        crc = zlib.crc32(host_array(leaf).tobytes(), crc)
+    return crc
+
+
+def _checked_meta(meta: Any) -> dict[str, Any]:
+    """The meta item, if it is of this schema and as it was written; CheckpointError if not."""
+    schema = meta.get("schema", 1)
+    if schema != SCHEMA_VERSION:
+        raise CheckpointError(
+            f"it has checkpoint schema {schema}, this kslc_jax reads {SCHEMA_VERSION}: "
+            "use the version that wrote it, see versions.json"
+        )
+    _compare(meta.get("checksums", {}), "meta", zlib.crc32(_text(meta)))
+    return meta
+
+
+def _meta(config: Config, metrics: dict[str, float], parts: dict[str, Any]) -> dict[str, Any]:
+    """The meta item that goes with the other items of a checkpoint."""
+    config_dict = config_lib.to_dict(config)
+    meta = {"schema": SCHEMA_VERSION, "config": config_dict, "metrics": metrics}
+    sums = {name: checksum(part) for name, part in parts.items()}
+    return {**meta, "checksums": {**sums, "meta": zlib.crc32(_text(meta))}}
+
+
+def _text(meta: dict[str, Any]) -> bytes:
+    """What the checksum of a meta item is taken over: all of it but the checksums."""
+    return json.dumps({k: v for k, v in meta.items() if k != "checksums"}, sort_keys=True).encode()
+
+
+def _compare(stored: dict[str, int], item: str, found: int) -> None:
+    """CheckpointError if `item` has another checksum than stored; older checkpoints have none."""
+    if stored.get(item, found) != found:
+        raise CheckpointError(f"the numbers of '{item}' are not those that were written")
 
 
 def _split(state: TrainState) -> dict[str, Any]:
@@ -76,72 +129,99 @@ class Store:
     def __init__(self, run_dir: Path, keep: int = 3):
         policies = ocp.checkpoint_managers
         self.folder = run_dir.resolve() / FOLDER
-        self._manager = ocp.CheckpointManager(
-            self.folder,
-            options=ocp.CheckpointManagerOptions(
-                preservation_policy=policies.AnyPreservationPolicy(
-                    [
-                        policies.LatestN(keep),
-                        policies.BestN(
-                            n=1,
-                            get_metric_fn=lambda m: m[BEST_METRIC],
-                            keep_checkpoints_without_metrics=False,
-                        ),
-                    ]
-                ),
-                cleanup_tmp_directories=True,
-            ),
+        best = policies.BestN(
+            n=1, get_metric_fn=lambda m: m[BEST_METRIC], keep_checkpoints_without_metrics=False
         )
+        self._options = ocp.CheckpointManagerOptions(
+            preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(keep), best]),
+            cleanup_tmp_directories=True,
+        )
+        self._manager = ocp.CheckpointManager(self.folder, options=self._options)
 
     def steps(self) -> list[int]:
         """Train steps that have a checkpoint, oldest first."""
         return sorted(self._manager.all_steps())
 
     def save(self, state: TrainState, config: Config, metrics: dict[str, float]) -> None:
-        """Starts writing `state` in the background; OSError if an earlier write failed."""
+        """Starts writing `state` in the background; CheckpointError if it cannot."""
         step = int(state.step)
         if step in self.steps():
             return
-        items = {name: ocp.args.StandardSave(part) for name, part in _split(state).items()}
-        meta = {"config": config_lib.to_dict(config), "metrics": metrics}
-        saved = self._manager.save(
-            step,
-            args=ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)),
-            metrics={BEST_METRIC: metrics.get(BEST_METRIC, 0.0)},
-            force=True,
-        )
-        if not saved:
-            raise OSError(f"orbax refused to save step {step} in {self.folder}")
+        parts = _split(state)
+        items = {name: ocp.args.StandardSave(part) for name, part in parts.items()}
+        meta = _meta(config, metrics, parts)
+        with self._writing():
+            saved = self._manager.save(
+                step,
+                args=ocp.args.Composite(**items, meta=ocp.args.JsonSave(meta)),
+                metrics={BEST_METRIC: metrics.get(BEST_METRIC, 0.0)},
+                force=True,
+            )
+            if not saved:
+                raise OSError(f"orbax refused to save step {step} in {self.folder}")
 
     def wait(self) -> None:
-        """Blocks until the last save is on disk."""
-        self._manager.wait_until_finished()
+        """Blocks until the last save is on disk; CheckpointError if it failed."""
+        with self._writing():
+            self._manager.wait_until_finished()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Generator[None]:
+        """After a failure: one CheckpointError, and a manager that has cleared the half-written
+        checkpoint away. The old one would raise again at each later call."""
+        try:
+            yield
+        except Exception as error:
+            with contextlib.suppress(Exception):
+                self._manager.close()
+            self._manager = ocp.CheckpointManager(self.folder, options=self._options)
+            full = "No space left" in str(error)
+            why = "no space left on the disk" if full else first_line(error)
+            raise CheckpointError(
+                f"could not save a checkpoint: {why}; those before it are whole"
+            ) from error
 
     def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState:
         """The latest whole checkpoint, as the type of `like` (arrays or their abstract shapes).
 
-        A damaged one is reported through `warn` and the one before it is taken.
+        A damaged one is reported through `warn`, put aside, and the one before it is taken.
         """
-        steps = self.steps()
-        if not steps:
-            raise CheckpointError(f"no checkpoint in {self.folder}")
+        steps, bad = self.steps(), {}
         for step in reversed(steps):
             try:
-                return self._restore(step, like)
-            except (ValueError, OSError, KeyError, TypeError) as error:
-                why = first_line(error)
-                warn(f"checkpoint {step} cannot be read ({why}); trying the one before")
-        raise CheckpointError(f"no readable checkpoint in {self.folder}")
+                state = self._restore(step, like)
+            except Exception as error:  # damaged metadata can lead orbax anywhere
+                bad[step] = first_line(error)
+                continue
+            self._put_aside(bad, step, warn)
+            return state
+        if not steps:
+            raise CheckpointError(f"no checkpoint in {self.folder}")
+        why = bad[steps[-1]]
+        raise CheckpointError(f"no readable checkpoint in {self.folder}; the latest: {why}")
+
+    def _put_aside(self, bad: dict[int, str], used: int, warn: Callable[[str], None]) -> None:
+        """Renames what is in the way of the steps to come."""
+        for step, why in bad.items():
+            aside = self.folder / f"damaged-{step}"
+            (self.folder / str(step)).rename(aside)
+            warn(f"checkpoint {step} is damaged ({why}), kept as {aside.name}; {used} is used")
+        if bad:
+            self._manager.reload()
 
     def _restore(self, step: int, like: TrainState) -> TrainState:
-        items = {
-            name: ocp.args.StandardRestore(_abstract(part)) for name, part in _split(like).items()
-        }
-        restored = self._manager.restore(step, args=ocp.args.Composite(**items))
+        parts = _split(like)
+        items = {name: ocp.args.StandardRestore(_abstract(part)) for name, part in parts.items()}
+        composite = ocp.args.Composite(**items, meta=ocp.args.JsonRestore())
+        restored = self._manager.restore(step, args=composite)
+        sums = _checked_meta(restored["meta"]).get("checksums", {})
+        for name in items:
+            _compare(sums, name, checksum(restored[name]))
         return _join({name: restored[name] for name in items}, like)
 
     def close(self) -> None:
         """Waits for writes and lets go of the folder."""
+        self.wait()
         self._manager.close()
 
 
@@ -188,8 +268,10 @@ def load_policy(path_or_name: str | Path) -> Policy:
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
         try:
             meta = reader.restore(folder, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
-            config = config_lib.from_dict(meta["meta"]["config"])
-            reached = meta["meta"]["metrics"]
+            meta = _checked_meta(meta["meta"])
+            config = config_lib.from_dict(meta["config"])
+            reached = meta["metrics"]
+            step = int(reached["step"])
             curriculum = curriculum_lib.init(config).replace(
                 v_max=jnp.asarray(reached["curriculum/v_max"]),
                 cycle_time=jnp.asarray(reached["curriculum/cycle_time"]),
@@ -197,14 +279,32 @@ def load_policy(path_or_name: str | Path) -> Policy:
             like = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
             args = ocp.args.Composite(params=ocp.args.StandardRestore(_abstract(like)))
             params = reader.restore(folder, args=args)["params"]
-        except (ConfigError, ValueError, OSError, KeyError, TypeError) as error:
+            _compare(meta.get("checksums", {}), "params", checksum(params))
+        except Exception as error:  # damaged metadata can lead orbax anywhere
             raise CheckpointError(
                 f"{folder} is no readable checkpoint: {first_line(error)}"
             ) from error
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves(params))
     if not finite:
         raise CheckpointError(f"{folder}: the parameters hold NaN or infinity")
-    return Policy(config, params, curriculum, int(folder.name) if folder.name.isdigit() else 0)
+    return Policy(config, params, curriculum, step)
+
+
+def save_policy(policy: Policy, folder: Path) -> None:
+    """Writes what `load_policy` reads and nothing else; CheckpointError if it cannot."""
+    reached = policy.curriculum
+    metrics = {
+        "step": policy.step,
+        "curriculum/v_max": float(reached.v_max),
+        "curriculum/cycle_time": float(reached.cycle_time),
+    }
+    meta = _meta(policy.config, metrics, {"params": policy.params})
+    items = {"params": ocp.args.StandardSave(policy.params), "meta": ocp.args.JsonSave(meta)}
+    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
+        try:
+            writer.save(folder.resolve(), args=ocp.args.Composite(**items))
+        except (OSError, ValueError) as error:
+            raise CheckpointError(f"cannot write {folder}: {first_line(error)}") from error
 
 
 def _checkpoint_folder(path: Path) -> Path:

@@ -21,8 +21,8 @@ import tyro
 
 from kslc_jax import config as config_lib
 from kslc_jax.config import ConfigError
+from kslc_jax.plots import EVALUATION
 
-EVALUATION = "evaluation.json"
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
 
 

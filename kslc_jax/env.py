@@ -4,6 +4,8 @@
 every field anew: nothing of an episode reaches the next one.
 """
 
+from collections.abc import Callable
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -82,7 +84,12 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
 
 
 def step(
-    config: Config, state: EnvState, action: jax.Array, key: jax.Array, curriculum: Curriculum
+    config: Config,
+    state: EnvState,
+    action: jax.Array,
+    key: jax.Array,
+    curriculum: Curriculum,
+    simulate: Callable[..., PhysicsState] = physics.step,
 ) -> tuple[EnvState, Outcome]:
     """Advances one environment by one control step; starts a new episode where one ended.
 
@@ -92,6 +99,7 @@ def step(
       action: [16] in joint order, unscaled.
       key: used for everything random in this step.
       curriculum: command range and gait cycle in force.
+      simulate: the engine, with the signature of `physics.step`.
 
     Returns:
       The state to act from next (already reset if the episode ended), and the step's outcome.
@@ -102,7 +110,7 @@ def step(
     noise = state.dynamics.noise
     action = _applied_action(config, action, state.last_action, noise, keys[0])
     target = jnp.asarray(robot.default_qpos[7:], jnp.float32) + config.env.action_scale * action
-    new = physics.step(
+    new = simulate(
         config.physics, state.physics, target, state.dynamics, config.randomize.ground_friction
     )
     broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.abs(new.qvel) < DIVERGED))

@@ -16,7 +16,7 @@ from typing import Literal
 import tyro
 
 from kslc_jax import runtime
-from kslc_jax.config import ConfigError, HighFidelity
+from kslc_jax.config import ConfigError
 
 HEADLINE = (
     ("survival", "survived", "{:.0%}"),
@@ -34,6 +34,9 @@ HEADLINE = (
     ("cost_of_transport", "CoT", "{:.2f}"),
     ("momentum_yaw_rms", "Lz rms", "{:.2f}"),
 )
+
+MOST_SAMPLES = 2_000_000
+"""Control steps of all trials whose traces are held in memory at once, about 300 bytes each."""
 
 
 @dataclass(frozen=True)
@@ -65,29 +68,51 @@ class Args:
             raise ConfigError("speeds: name at least one")
 
 
-def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, float]]:
-    """One row of metrics per commanded speed, with `forward_mean_ci` over seeds."""
+def measure(
+    policy, setting, speeds, seeds: int, seed: int = 0, progress=lambda share: None
+) -> list[dict[str, float]]:
+    """One row of metrics per commanded forward speed [m/s], over `seeds` trials each.
+
+    Args:
+      policy: who is tried.
+      setting: conditions, a `trials.Setting`.
+      speeds: commands.
+      seeds: trials per command.
+      seed: of initial states and randomisation.
+      progress: told the share that is done.
+    """
     import jax
     import numpy as np
 
     from kslc_jax import gait_metrics, physics, trials
 
-    engine = HighFidelity() if args.fidelity == "high" else policy.config.physics
-    setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
-    velocities = np.zeros((len(args.speeds) * args.seeds, 3))
-    velocities[:, 0] = np.repeat(args.speeds, args.seeds)
-    pieces = []
-    for piece in trials.run(policy, setting, velocities, args.seed):
-        pieces.append(piece)
-        progress(len(pieces) / round(args.seconds))
-    trace = trials.join(pieces)
-    robot, dt = physics.robot_for(engine), engine.control_dt
+    robot, dt = physics.robot_for(setting.physics), setting.physics.control_dt
+    at_once = max(1, MOST_SAMPLES // (seeds * round(setting.seconds / dt)))
     rows = []
-    for i, speed in enumerate(args.speeds):
-        mine = slice(i * args.seeds, (i + 1) * args.seeds)
-        part = jax.tree.map(lambda x, mine=mine: x[:, mine], trace)
-        rows.append({"command": speed} | gait_metrics.summary(part, speed, robot, dt))
+    for start in range(0, len(speeds), at_once):
+        group = speeds[start : start + at_once]
+        velocities = np.zeros((len(group) * seeds, 3))
+        velocities[:, 0] = np.repeat(group, seeds)
+        pieces = []
+        for piece in trials.run(policy, setting, velocities, seed):
+            pieces.append(piece)
+            done = len(pieces) / round(setting.seconds)
+            progress((start + done * len(group)) / len(speeds))
+        for i, speed in enumerate(group):
+            mine = slice(i * seeds, (i + 1) * seeds)
+            part = [jax.tree.map(lambda x, mine=mine: x[:, mine], piece) for piece in pieces]
+            numbers = gait_metrics.summary(trials.join(part), speed, robot, dt)
+            rows.append({"command": speed} | numbers)
     return rows
+
+
+def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, float]]:
+    """One row of metrics per commanded speed, with `forward_mean_ci` over seeds."""
+    from kslc_jax import trials
+
+    engine = trials.engine(policy, args.fidelity)
+    setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
+    return measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
 
 
 def table(rows: list[dict[str, float]], title: str):
@@ -104,12 +129,18 @@ def table(rows: list[dict[str, float]], title: str):
     return out
 
 
+def console():
+    """A rich console as wide as the terminal, or where there is none as wide as the table."""
+    from rich.console import Console
+
+    return Console(highlight=False, width=None if sys.stdout.isatty() else 180)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
-        from rich.console import Console
         from rich.progress import Progress
 
         from kslc_jax.checkpoint import CheckpointError, load_policy
@@ -121,12 +152,12 @@ def main(argv: list[str] | None = None) -> int:
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    console = Console(highlight=False)
-    with Progress(console=console, transient=True) as bar:
+    screen = console()
+    with Progress(console=screen, transient=True) as bar:
         task = bar.add_task("trying", total=1.0)
         rows = sweep(args, policy, lambda share: bar.update(task, completed=share))
     title = f"{args.policy}, train step {policy.step}, {args.fidelity} fidelity"
-    console.print(table(rows, title))
+    screen.print(table(rows, title))
     if args.json is not None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         what = {"policy": str(args.policy), "step": policy.step, "fidelity": args.fidelity}

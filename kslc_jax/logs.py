@@ -1,13 +1,19 @@
 """What a person sees of a training: JSONL and TensorBoard files, and progress on the terminal."""
 
+import contextlib
 import json
+import math
+import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2
+from tensorboardX.summary import Summary
 
 from kslc_jax.config import Config
 
@@ -15,35 +21,93 @@ PLAIN_SECONDS = 10.0
 """Seconds between progress lines where the output is no terminal."""
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Writes a file at once: whatever happens, `path` holds all of the old or all of the new."""
+    part = path.with_name(f".{path.name}.part")
+    try:
+        part.write_text(text)
+        os.replace(part, path)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+
+
 class MetricsFile:
     """metrics.jsonl (one record a line) and TensorBoard events of one run folder.
 
     Going on from train step `after` drops the records that lie behind it: the resumed run writes
-    them again.
+    them again. A full disk is told through `warn`, once; records wait until there is room.
     """
 
-    def __init__(self, run_dir: Path, after: int = 0):
+    def __init__(self, run_dir: Path, after: int = 0, warn: Callable[[str], None] = print):
         self.path = run_dir / "metrics.jsonl"
         self.seconds_before = 0.0
         """Wall time [s] that the kept records have seen."""
+        kept = []
         if self.path.exists():
-            kept = [line for line in self.path.read_text().splitlines() if _step(line) <= after]
-            self.path.write_text("".join(f"{line}\n" for line in kept))
-            self.seconds_before = json.loads(kept[-1]).get("seconds", 0.0) if kept else 0.0
-        self._file = self.path.open("a")
-        self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=after)
+            lines = self.path.read_text(errors="replace").splitlines()
+            kept = [line for line in lines if _step(line) <= after]
+            write_whole(self.path, "".join(f"{line}\n" for line in kept))
+        last = json.loads(kept[-1]) if kept else {}
+        self.seconds_before = last.get("seconds", 0.0)
+        self._file = self.path.open("ab", buffering=0)
+        self._waiting = b""
+        self._board = _Board(run_dir / "tensorboard", int(last.get("env_steps", 0)))
+        self._warn, self._full = warn, False
 
     def write(self, record: dict[str, float]) -> None:
         """Appends one record; on disk at once."""
-        self._file.write(json.dumps(record) + "\n")
-        self._file.flush()
-        for name, value in record.items():
-            self._board.add_scalar(name, value, int(record["env_steps"]))
+        self._waiting += (json.dumps(record) + "\n").encode()
+        try:
+            self._flush()
+            self._board.write(record)
+            self._full = False
+        except OSError as error:
+            if not self._full:
+                self._warn(f"cannot write metrics ({error.strerror}); training goes on")
+            self._full = True
+
+    def _flush(self) -> None:
+        """Writes what fits; a line that is torn by a full disk is completed later."""
+        while self._waiting:
+            self._waiting = self._waiting[self._file.write(self._waiting) :]
 
     def close(self) -> None:
         """Flushes both."""
+        with contextlib.suppress(OSError):  # said before
+            self._flush()
+        with contextlib.suppress(OSError):
+            self._board.close()
         self._file.close()
-        self._board.close()
+
+
+class _Board:
+    """TensorBoard events. Written in this thread: the one of tensorboardX's SummaryWriter dies of a
+    full disk, and the training would then wait for it for ever."""
+
+    def __init__(self, folder: Path, after: int):
+        folder.mkdir(exist_ok=True)
+        self._events = EventsWriter(str(folder / "events"), f".{os.getpid()}.{after}")
+        session = event_pb2.SessionLog(
+            status=event_pb2.SessionLog.START
+        )  # hides what was shown beyond `after`
+        self._events.write_event(event_pb2.Event(step=after + 1, session_log=session))
+
+    def write(self, record: dict[str, float]) -> None:
+        """One record, over its env_steps; what is not finite is left out."""
+        values = [
+            Summary.Value(tag=name, simple_value=value)
+            for name, value in record.items()
+            if math.isfinite(value)
+        ]
+        step = int(record["env_steps"])
+        event = event_pb2.Event(wall_time=time.time(), step=step, summary=Summary(value=values))
+        self._events.write_event(event)
+        self._events.flush()
+
+    def close(self) -> None:
+        """Flushes."""
+        self._events.close()
 
 
 def _step(line: str) -> int:
@@ -72,6 +136,10 @@ class Progress:
     def say(self, message: str) -> None:
         """One line above the progress."""
         self.console.print(message, markup=False)
+
+    def warn(self, message: str) -> None:
+        """Something that training goes on in spite of."""
+        self.say(f"warning: {message}")
 
     def show(self, record: dict[str, float]) -> None:
         """Shows one record of metrics."""

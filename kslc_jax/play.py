@@ -1,73 +1,166 @@
-"""Watch a policy: python -m kslc_jax.play POLICY --gait-strip strip.png --speeds 2.0 3.5
+"""Watch a policy: python -m kslc_jax.play POLICY
 
-Runs the policy in full C MuJoCo at high fidelity and draws, off screen, the paper's gait figure
-(the robot every 0.25 s on a 1 m grid, one strip per speed) and, with --video, a film of one speed
-after the other. POLICY is a run folder, a checkpoint folder, or a shipped policy's name.
+Opens a live viewer in the browser: sliders command the robot while it runs. With --gait-strip or
+--video it draws, off screen, the paper's gait figure (the robot every 0.25 s on a 1 m grid, one
+strip per speed) or a film of one speed after the other instead. Full C MuJoCo at high fidelity
+unless told otherwise. POLICY is a run folder, a checkpoint folder, or a shipped policy's name.
 """
 
+import contextlib
+import ipaddress
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
 from kslc_jax import runtime
-from kslc_jax.config import ConfigError, HighFidelity
+from kslc_jax.config import ConfigError
 
 FPS = 50
+
+SPEED_SECONDS = 0.5
+"""Span over which the speed written into the video is taken."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to draw."""
+    """What to watch, and how."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
+    fidelity: Literal["train", "high"] = "high"
+    """train: the training engine. high: full C MuJoCo at 1 ms."""
+    seed: int = 0
+    """Of the initial state."""
+    host: str = "127.0.0.1"
+    """Address of the viewer. The default is reached from this machine only; 0.0.0.0 from all."""
+    port: int = 8080
+    """Port of the viewer; 0 takes any that is free."""
     speeds: tuple[float, ...] = (2.0, 3.5)
-    """Commanded forward speeds [m/s]."""
+    """Commanded forward speeds of strip and video [m/s]."""
     seconds: float = 2.0
-    """Time shown per speed, after some seconds to gather speed."""
+    """Time shown per speed in strip and video, after some seconds to gather speed."""
     gait_strip: Path | None = None
     """PNG to write: one strip per speed."""
     video: Path | None = None
     """MP4 to write; needs the package imageio-ffmpeg (pip install 'kslc_jax[video]')."""
-    seed: int = 0
-    """Of the initial state."""
 
     def __post_init__(self):
         if self.seconds <= 0 or not self.speeds:
             raise ConfigError("seconds must be positive, and speeds name at least one")
-        if self.gait_strip is None and self.video is None:
-            raise ConfigError("nothing to do: give --gait-strip, --video, or both")
+        if not 0 <= self.port < 2**16:
+            raise ConfigError("port must lie in 0 to 65535")
+
+    @property
+    def live(self) -> bool:
+        """Whether to open the viewer."""
+        return self.gait_strip is None and self.video is None
+
+
+# ---------------------------------------------------------------------------------------- pictures
 
 
 def record(args: Args, policy, settle: float = 4.0):
-    """qpos [T, S, 23] per speed after `settle` seconds, and the control step [s]."""
+    """Trace [T, S, ...], the step at which `settle` seconds are over, and the control step [s]."""
+    import jax
     import numpy as np
 
     from kslc_jax import trials
 
     velocities = np.zeros((len(args.speeds), 3))
     velocities[:, 0] = args.speeds
-    engine = HighFidelity()
+    engine = trials.engine(policy, args.fidelity)
     setting = trials.Setting(engine, seconds=settle + max(1.0, np.ceil(args.seconds)))
     trace = trials.join(list(trials.run(policy, setting, velocities, args.seed)))
     start = round(settle / engine.control_dt)
-    shown = slice(start, start + round(args.seconds / engine.control_dt))
-    return trace.qpos[shown], trace.alive[-1], engine.control_dt
+    stop = start + round(args.seconds / engine.control_dt)
+    return jax.tree.map(lambda x: x[:stop], trace), start, engine.control_dt
 
 
-def write_video(path: Path, qpos, dt: float) -> None:
-    """Films the speeds one after the other at real time."""
+def caption(picture, text: str):
+    """The picture [H, W, 3] with `text` in its upper left corner."""
+    import numpy as np
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(picture)
+    size = image.height // 20
+    ImageDraw.Draw(image).multiline_text(
+        (size, size),
+        text,
+        fill="white",
+        stroke_fill="black",
+        stroke_width=size // 10,
+        font=ImageFont.load_default(size),
+    )
+    return np.asarray(image)
+
+
+def write_video(path: Path, args: Args, trace, start: int, dt: float) -> None:
+    """Films the speeds one after the other at real time, commanded and actual speed written in."""
     import imageio.v2 as imageio
+    import imageio_ffmpeg  # noqa: F401 (imageio would say less clearly that it is missing)
 
     from kslc_jax import render
 
     every = max(1, round(1.0 / (FPS * dt)))
+    span = round(SPEED_SECONDS / dt)
+    path.parent.mkdir(parents=True, exist_ok=True)
     with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as film:
-        for i in range(qpos.shape[1]):
-            for picture in render.frames(qpos[::every, i]):
-                film.append_data(picture)
+        for i, command in enumerate(args.speeds):
+            pictures = render.frames(trace.qpos[start::every, i])
+            for step, picture in zip(range(start, len(trace.qpos), every), pictures, strict=True):
+                speed = trace.linvel[step + 1 - span : step + 1, i, 0].mean()
+                text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
+                film.append_data(caption(picture, text))
+
+
+def draw(args: Args, policy) -> None:
+    """Writes the gait strip and the video that were asked for."""
+    import matplotlib.image
+
+    from kslc_jax import render
+
+    trace, start, dt = record(args, policy)
+    for speed, up in zip(args.speeds, trace.alive[-1], strict=True):
+        if not up:
+            print(f"warning: fell at {speed:g} m/s")
+    if args.gait_strip is not None:
+        strips = [render.gait_strip(trace.qpos[start:, i], dt) for i in range(len(args.speeds))]
+        args.gait_strip.parent.mkdir(parents=True, exist_ok=True)
+        matplotlib.image.imsave(args.gait_strip, render.stack(strips))
+        print(f"wrote {args.gait_strip}")
+    if args.video is not None:
+        write_video(args.video, args, trace, start, dt)
+        print(f"wrote {args.video}")
+
+
+# ------------------------------------------------------------------------------------------ viewer
+
+
+def is_local(host: str) -> bool:
+    """Whether an address is reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def watch(args: Args) -> None:
+    """Serves the viewer until Ctrl-C."""
+    try:
+        from kslc_jax.viewer import Viewer
+    except ImportError as error:
+        raise ImportError(f"the viewer: {error} (pip install 'kslc_jax[viewer]')") from error
+
+    if not is_local(args.host):
+        print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
+    with contextlib.suppress(KeyboardInterrupt):
+        viewer = Viewer(args.policy, args.fidelity, args.host, args.port, args.seed)
+        host = "localhost" if is_local(args.host) else args.host
+        print(f"viewer: http://{host}:{viewer.server.get_port()} (Ctrl-C ends it)", flush=True)
+        viewer.run()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -75,27 +168,18 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
-        from kslc_jax import render  # before anything that imports mujoco
-        from kslc_jax.checkpoint import CheckpointError, load_policy
+        if not args.live:
+            from kslc_jax import render  # noqa: F401 (before anything that imports mujoco)
     except (ConfigError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    try:
-        policy = load_policy(args.policy)
-        qpos, alive, dt = record(args, policy)
-        for speed, up in zip(args.speeds, alive, strict=True):
-            if not up:
-                print(f"warning: fell at {speed:g} m/s")
-        if args.gait_strip is not None:
-            import matplotlib.image
+    from kslc_jax.checkpoint import CheckpointError, load_policy
 
-            strips = [render.gait_strip(qpos[:, i], dt) for i in range(qpos.shape[1])]
-            args.gait_strip.parent.mkdir(parents=True, exist_ok=True)
-            matplotlib.image.imsave(args.gait_strip, render.stack(strips))
-            print(f"wrote {args.gait_strip}")
-        if args.video is not None:
-            write_video(args.video, qpos, dt)
-            print(f"wrote {args.video}")
+    try:
+        if args.live:
+            watch(args)
+        else:
+            draw(args, load_policy(args.policy))
     except (CheckpointError, ConfigError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

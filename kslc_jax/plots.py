@@ -30,6 +30,9 @@ PANELS: tuple[tuple[str, str, str], ...] = (
 )
 
 
+EVALUATION = "evaluation.json"
+"""What `compare` calls an evaluation in a run folder."""
+
 PERFORMANCE: tuple[tuple[str, str], ...] = (
     ("forward_mean", "mean forward speed [m/s]"),
     ("survival", "share that did not fall"),
@@ -89,14 +92,15 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
 
 
 def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, float]]]]:
-    """Rows of evaluation files by method: the folder's name without '-seedN'; ValueError."""
+    """Rows of evaluation files by method: the file's name, or where that is evaluation.json its
+    folder's, without '-seedN'; ValueError."""
     found: dict[str, list[list[dict[str, float]]]] = {}
     for path in paths:
         try:
             rows = json.loads(path.read_text())["rows"]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is no evaluation (made by evaluate --json)") from error
-        name = path.stem if path.parent.name == "" else path.parent.name
+        name = path.resolve().parent.name if path.name == EVALUATION else path.stem
         found.setdefault(name.rsplit("-seed", 1)[0], []).append(rows)
     return found
 

@@ -20,9 +20,9 @@ import tyro
 
 from kslc_jax import evaluate, runtime
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.plots import EVALUATION
 
 SHIPPED = "xbot_l_run"
-EVALUATION = "evaluation.json"
 MILESTONES = "milestones.json"
 
 BANDS = {

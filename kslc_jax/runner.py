@@ -9,7 +9,10 @@ import dataclasses
 import fcntl
 import importlib.metadata
 import json
+import math
+import os
 import platform
+import shlex
 import signal
 import subprocess
 import time
@@ -20,11 +23,16 @@ from types import FrameType
 import jax
 
 from kslc_jax import config as config_lib
-from kslc_jax import physics, train_step
-from kslc_jax.checkpoint import BEST_METRIC, Store, first_line
+from kslc_jax import physics, recovery, train_step
+from kslc_jax.checkpoint import BEST_METRIC, CheckpointError, Store, first_line
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.logs import MetricsFile, Progress
+from kslc_jax.logs import MetricsFile, Progress, write_whole
+from kslc_jax.recovery import Health
+from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
+
+SAMPLE_BYTES = 1024
+"""What a sample of a rollout takes at least: its frames, actions and reward terms."""
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
@@ -72,18 +80,37 @@ def versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
+def _writing(run_dir: Path) -> Generator[None]:
+    """RunError where the run folder cannot be written to."""
+    try:
+        yield
+    except OSError as error:
+        why = error.strerror or first_line(error)
+        raise RunError(f"cannot write to {run_dir}: {why}") from error
+
+
+@contextlib.contextmanager
 def locked(run_dir: Path) -> Generator[None]:
-    """Holds the run folder's lock; RunError if another process does."""
-    with (run_dir / ".lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise RunError(f"{run_dir} is in use by another process") from error
+    """Holds the run folder's lock, which the system takes back at the process's death; RunError
+    with the other's process id if another process holds it."""
+    with _writing(run_dir):
+        file = (run_dir / ".lock").open("a+")
+    with file:
+        with _writing(run_dir):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                holder = file.read().strip() or "unknown"
+                raise RunError(f"{run_dir} is in use by another process, id {holder}") from error
+            file.truncate(0)
+            file.write(str(os.getpid()))
+            file.flush()
         yield
 
 
 def open_folder(run_dir: Path, config: Config, resume: bool) -> None:
-    """Creates the run folder, or checks that it may go on; RunError or ConfigError if not."""
+    """Fills a new run folder, or checks that it may go on; RunError or ConfigError if not."""
     path = run_dir / "config.json"
     if resume:
         difference(read_config(run_dir), config)
@@ -92,23 +119,22 @@ def open_folder(run_dir: Path, config: Config, resume: bool) -> None:
         raise RunError(
             f"{run_dir} already holds a training: add --resume, or name another --run-dir"
         )
-    try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(config_lib.to_dict(config), indent=1))
-        (run_dir / "versions.json").write_text(json.dumps(versions(), indent=1))
-    except OSError as error:
-        raise RunError(f"cannot write to {run_dir}: {error.strerror}") from error
+    with _writing(run_dir):
+        write_whole(run_dir / "versions.json", json.dumps(versions(), indent=1))
+        write_whole(path, json.dumps(config_lib.to_dict(config), indent=1))
 
 
 def read_config(run_dir: Path) -> Config:
     """The config stored in a run folder; RunError if there is none, ConfigError if damaged."""
     path = run_dir / "config.json"
-    if not path.exists():
-        raise RunError(f"{run_dir} holds no training to resume (no config.json)")
     try:
         return config_lib.from_dict(json.loads(path.read_text()))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is damaged: {error}") from error
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise RunError(f"{run_dir} holds no training to resume (no config.json)") from error
+    except OSError as error:
+        raise RunError(f"cannot read {path}: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:  # no JSON, or no text
+        raise ConfigError(f"{path} is damaged: {first_line(error)}") from error
 
 
 def difference(stored: Config, wanted: Config) -> None:
@@ -128,38 +154,76 @@ def difference(stored: Config, wanted: Config) -> None:
             walk(getattr(stored, f.name), getattr(wanted, f.name), f.name)
 
 
+def memory_need(config: Config, like: TrainState) -> int:
+    """Bytes that the state and one rollout take at least."""
+    state = sum(math.prod(x.shape) * 4 for x in jax.tree.leaves(like))
+    return state + SAMPLE_BYTES * config.batch_size
+
+
+def check_memory(config: Config, like: TrainState) -> None:
+    """ConfigError where the state and one rollout cannot fit into this machine's memory."""
+    stats = jax.devices()[0].memory_stats() or {}
+    memory = stats.get("bytes_limit") or os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    need = memory_need(config, like)
+    if need > memory:
+        raise ConfigError(
+            f"env.num_envs, env.frames, ppo.rollout_steps and network sizes need {need / 2**30:.0f}"
+            f" GiB or more; {jax.devices()[0].device_kind} has {memory / 2**30:.0f}"
+        )
+
+
 def train(config: Config, run_dir: Path, resume: bool, progress: Progress) -> TrainState:
-    """Trains until `config.run.steps`, a signal, or an error; the state is saved in each case."""
-    open_folder(run_dir, config, resume)
-    with locked(run_dir), contextlib.closing(Store(run_dir, config.run.keep)) as store:
-        init, step_fn = train_step.make(config)
-        start = time.monotonic()
-        if resume:
-            like = jax.eval_shape(init)
-            state = store.restore(like, lambda text: progress.say(f"warning: {text}"))
-            progress.say(f"resumed at train step {int(state.step)}")
-        else:
-            state = init()
-        compiled = step_fn.lower(state).compile()
-        progress.say(f"compiled in {time.monotonic() - start:.0f} s; training")
-        try:
-            return _loop(config, run_dir, state, compiled, store, progress)
-        finally:
-            progress.close()
+    """Trains until `config.run.steps`, a signal, or an error; the state is saved in each case.
+
+    Raises:
+      RunError, ConfigError, CheckpointError: it cannot start, or its last state cannot be saved.
+      NumbersError: numbers went bad again and again.
+    """
+    init, step_fn = train_step.make(config)
+    like = jax.eval_shape(init)
+    check_memory(config, like)
+    if not resume:
+        with _writing(run_dir):
+            run_dir.mkdir(parents=True, exist_ok=True)
+    with locked(run_dir), contextlib.closing(progress):
+        open_folder(run_dir, config, resume)
+        with _writing(run_dir):
+            store = Store(run_dir, config.run.keep)
+        with contextlib.closing(store):
+            start = time.monotonic()
+            state = store.restore(like, progress.warn) if resume else init()
+            if resume:
+                progress.say(f"resumed at train step {int(state.step)}")
+            compiled = step_fn.lower(state).compile()
+            progress.say(f"compiled in {time.monotonic() - start:.0f} s; training")
+
+            def again() -> TrainState:
+                with _going_on(progress):
+                    store.wait()
+                return store.restore(like, progress.warn) if store.steps() else init()
+
+            def go(state: TrainState) -> TrainState:
+                return _loop(config, run_dir, state, compiled, store, progress)
+
+            return recovery.persist(config, run_dir, go, state, again, progress.warn)
 
 
 def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> TrainState:
     """Steps, logs and saves; returns the last state, which is on disk."""
     first = int(state.step)
-    file = MetricsFile(run_dir, after=first)
+    with _writing(run_dir):
+        file = MetricsFile(run_dir, first, progress.warn)
     saved = time.monotonic()
     begun = saved - file.seconds_before
     record: dict[str, float] = {}
+    health, watchdog = Health(state), Watchdog()
     with _Stop() as stop, contextlib.closing(file):
         for step in range(first + 1, config.num_updates + 1):
             tick = time.monotonic()
-            state, metrics = step_fn(state)
-            record = {name: float(value) for name, value in jax.device_get(metrics).items()}
+            health.before(state)
+            with watchdog.step():
+                state, metrics = step_fn(state)
+                record = {name: float(value) for name, value in jax.device_get(metrics).items()}
             now = time.monotonic()
             record |= {
                 "step": step,
@@ -171,45 +235,50 @@ def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> 
             if step % config.run.log_every == 0:
                 file.write(record)
             progress.show(record)
+            health.after(record)
             if stop.requested:
                 break
-            if now - saved > 60.0 * config.run.checkpoint_minutes:
+            health.check()
+            if health.good and now - saved > 60.0 * config.run.checkpoint_minutes:
                 saved = now
                 _save(store, state, config, record, progress)
-        if record:
-            _save(store, state, config, record, progress)
-            _settle(store)
-    _farewell(config, run_dir, state, stop.requested, progress)
+        if record and health.good:
+            with _going_on(progress):
+                store.wait()
+            store.save(state, config, record)
+            store.wait()
+    _farewell(config, run_dir, int(state.step), stop.requested, health.good, progress)
     return state
 
 
+@contextlib.contextmanager
+def _going_on(progress: Progress) -> Generator[None]:
+    """Says that a checkpoint could not be saved; hours of training must not die of it."""
+    try:
+        yield
+    except CheckpointError as error:
+        progress.warn(f"{error}; training goes on")
+
+
 def _save(store: Store, state: TrainState, config: Config, record, progress: Progress) -> None:
-    """Saves; a failure is said, and training goes on with the checkpoints before."""
-    try:
-        store.save(state, config, record)
-    except Exception as error:  # whatever orbax met: hours of training must not die of it
-        progress.say(f"warning: could not save a checkpoint: {first_line(error)}; training goes on")
-
-
-def _settle(store: Store) -> None:
-    """Waits until the last save is on disk; RunError if it is not."""
-    try:
+    """Starts a save, and says whether the one before failed."""
+    with _going_on(progress):
         store.wait()
-    except Exception as error:
-        message = f"the last state could not be saved: {first_line(error)}"
-        raise RunError(f"{message}; the checkpoints before it are whole") from error
+    with _going_on(progress):
+        store.save(state, config, record)
 
 
 def _farewell(
-    config: Config, run_dir: Path, state: TrainState, stopped_by: str | None, progress: Progress
+    config: Config, run_dir: Path, step: int, stopped_by: str | None, good: bool, progress: Progress
 ) -> None:
+    saved = "saved" if good else "not saved: the numbers are not finite"
     if stopped_by:
         progress.say(
-            f"stopped by {stopped_by} at train step {int(state.step)}, saved; go on with: "
-            f"python -m kslc_jax.train --resume --run-dir {run_dir}"
+            f"stopped by {stopped_by} at train step {step}, {saved}; go on with: "
+            f"python -m kslc_jax.train --resume --run-dir {shlex.quote(str(run_dir))}"
         )
     else:
-        progress.say(f"done: {config.num_updates} train steps, saved in {run_dir}")
+        progress.say(f"done: {config.num_updates} train steps, {saved} in {run_dir}")
 
 
 def describe(config: Config, run_dir: Path) -> str:

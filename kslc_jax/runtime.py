@@ -1,7 +1,17 @@
 """What must be set before JAX starts, and what the machine decides. Imports JAX only when asked."""
 
+import contextlib
+import faulthandler
+import inspect
+import logging
 import os
+import statistics
+import sys
+import time
+from collections import deque
+from collections.abc import Generator
 from pathlib import Path
+from types import TracebackType
 
 BAD_JAX = ("0.10.", "0.11.0")
 """JAX versions whose CPU backend can hang for ever in batched Cholesky factorisations."""
@@ -14,17 +24,40 @@ def cache_dir() -> Path:
 
 
 def prepare() -> None:
-    """Quiet XLA and a persistent compilation cache; values the user set stay."""
+    """Quiet XLA and orbax, and a persistent compilation cache; values the user set stay."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_dir()))
+
+    # Orbax raises what went wrong, and besides tells of it in pages of its threads' tracebacks.
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    sys.excepthook, sys.unraisablehook = _excepthook, _unraisablehook
+
+
+def _excepthook(
+    kind: type[BaseException], error: BaseException, trace: TracebackType | None
+) -> None:
+    if str(error) != "Event loop is closed":
+        sys.__excepthook__(kind, error, trace)
+
+
+def _unraisablehook(args: "sys.UnraisableHookArgs") -> None:
+    if not inspect.iscoroutine(args.object):
+        sys.__unraisablehook__(args)
 
 
 def auto_preset() -> str:
     """'paper' where JAX has an accelerator, 'laptop' without one."""
     import jax
 
-    check_jax(jax.__version__, jax.default_backend())
     return "laptop" if jax.default_backend() == "cpu" else "paper"
+
+
+def require_good_jax() -> None:
+    """RuntimeError where the installed JAX is known to hang on this machine."""
+    import jax
+
+    check_jax(jax.__version__, jax.default_backend())
 
 
 def check_jax(version: str, backend: str) -> None:
@@ -34,3 +67,32 @@ def check_jax(version: str, backend: str) -> None:
             f"jax {version} can hang for ever on a CPU, install another: "
             "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
         )
+
+
+class Watchdog:
+    """Prints every thread's stack to stderr while a step takes far longer than those before.
+
+    faulthandler's thread does the waiting and the printing: it runs even where this program's
+    threads cannot.
+    """
+
+    def __init__(self, factor: float = 20.0, least: float = 60.0, first: float = 600.0):
+        self.factor, self.least, self.first = factor, least, first
+        self._seconds: deque[float] = deque(maxlen=100)
+
+    def limit(self) -> float:
+        """Seconds that the next step may take."""
+        if not self._seconds:
+            return self.first
+        return max(self.least, self.factor * statistics.median(self._seconds))
+
+    @contextlib.contextmanager
+    def step(self) -> Generator[None]:
+        """Watches over one step."""
+        start = time.monotonic()
+        faulthandler.dump_traceback_later(self.limit(), file=2)
+        try:
+            yield
+        finally:
+            faulthandler.cancel_dump_traceback_later()
+            self._seconds.append(time.monotonic() - start)

@@ -92,9 +92,11 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     try:
         args = parse(argv)
+        runtime.require_good_jax()
         from kslc_jax import runner
         from kslc_jax.checkpoint import CheckpointError
         from kslc_jax.logs import Progress
+        from kslc_jax.recovery import NumbersError
     except (ConfigError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -106,6 +108,9 @@ def main(argv: list[str] | None = None) -> int:
     except (ConfigError, runner.RunError, CheckpointError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except NumbersError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         print("interrupted before the state was saved", file=sys.stderr)
         return 130

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import env, networks, ppo
+from kslc_jax import env, maths, networks, ppo
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
@@ -19,6 +19,7 @@ from kslc_jax.networks import Gaussian, Params
 from kslc_jax.ppo import Learner, Samples
 
 Metrics = dict[str, jax.Array]
+Spread = Callable[[jax.Array], jax.Array]
 
 
 @flax.struct.dataclass
@@ -75,14 +76,18 @@ def init(config: Config, seed: int | jax.Array) -> TrainState:
     )
 
 
-def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
-    """One rollout and one update; see the module's first line."""
-    key_roll, key_update = jax.random.split(jax.random.fold_in(state.key, state.step))
+def step(
+    config: Config, state: TrainState, spread: Spread = lambda index: index
+) -> tuple[TrainState, Metrics]:
+    """One rollout and one update; see the module's first line. `spread` places the indices of a
+    minibatch's samples where there are several devices."""
+    key_roll, key_update = step_keys(state)
     params = state.learner.params
-    envs, traj = rollout(config, params, state.env, state.curriculum, key_roll)
+    start = jax.vmap(usable)(state.env)
+    envs, traj = rollout(config, params, start, state.curriculum, key_roll)
     last_value = networks.value(config, params, envs.privileged_history)
     samples = _samples(config, traj, last_value)
-    apply = _observer(config, state.env, traj)
+    apply = _observer(config, start, traj, spread)
     log_std = networks.log_std(config, params)
     learner, losses = ppo.update(config.ppo, apply, log_std, state.learner, samples, key_update)
     progress = _progress(traj.outcome)
@@ -91,31 +96,68 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     return new, _metrics(config, new, traj.outcome, progress, losses)
 
 
+def step_keys(state: TrainState) -> jax.Array:
+    """[2] keys of one train step: of the rollout and of the update."""
+    return jax.random.split(jax.random.fold_in(state.key, state.step))
+
+
 def rollout(
     config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
 ) -> tuple[EnvState, Trajectory]:
     """T control steps of N environments under the sampled policy."""
 
     def one(envs: EnvState, key: jax.Array) -> tuple[EnvState, Trajectory]:
-        key_act, key_env = jax.random.split(key)
-        dist = networks.policy(config, params, envs.history)
-        action = dist.sample(key_act)
-        keys = jax.random.split(key_env, config.env.num_envs)
-        new, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(
-            config, envs, action, keys, curriculum
-        )
-        return new, Trajectory(
-            action=action,
-            mean=dist.mean,
-            log_prob=dist.log_prob(action),
-            value=networks.value(config, params, envs.privileged_history),
-            age=envs.time,
-            frame=envs.history[:, -1],
-            privileged=envs.privileged_history[:, -1],
-            outcome=outcome,
-        )
+        new, traj = control_step(config, params, envs, curriculum, key)
+        new, outcome = jax.vmap(contain)(new, traj.outcome)
+        return new, traj.replace(outcome=outcome)
 
     return jax.lax.scan(one, envs, jax.random.split(key, config.ppo.rollout_steps))
+
+
+def control_step(
+    config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
+) -> tuple[EnvState, Trajectory]:
+    """One control step of N environments, as it comes out: a row of the trajectory, [N]."""
+    key_act, key_env = jax.random.split(key)
+    dist = networks.policy(config, params, envs.history)
+    action = dist.sample(key_act)
+    keys = jax.random.split(key_env, config.env.num_envs)
+    new, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(config, envs, action, keys, curriculum)
+    return new, Trajectory(
+        action=action,
+        mean=dist.mean,
+        log_prob=dist.log_prob(action),
+        value=networks.value(config, params, envs.privileged_history),
+        age=envs.time,
+        frame=envs.history[:, -1],
+        privileged=envs.privileged_history[:, -1],
+        outcome=outcome,
+    )
+
+
+def finite(tree: object) -> jax.Array:
+    """[] bool: no number of the tree is NaN or infinite."""
+    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
+
+
+def usable(state: EnvState) -> EnvState:
+    """The state of ONE environment; a non-finite one as a blank whose physics is sure to break, so
+    that `env.step` starts a new episode and nobody sees the NaN."""
+    blank = jax.tree.map(jnp.zeros_like, state)
+    physics = blank.physics.replace(qvel=jnp.full_like(blank.physics.qvel, jnp.nan))
+    return maths.tree_where(finite(state), state, blank.replace(physics=physics))
+
+
+def contain(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
+    """What ONE environment gave. Where any number is not finite the step counts as broken: it is
+    worth nothing, and its episode is over."""
+    broken = out.broken | ~finite(state) | ~finite(out)
+    lost = broken & ~(out.terminated | out.truncated)
+    physics = state.physics.replace(qvel=jnp.where(lost, jnp.nan, state.physics.qvel))
+    nothing = jax.tree.map(jnp.zeros_like, out)
+    nothing = nothing.replace(terminated=jnp.ones((), bool), broken=jnp.ones((), bool))
+    return usable(state.replace(physics=physics)), maths.tree_where(broken, nothing, out)
 
 
 def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
@@ -138,12 +180,15 @@ def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
 
-def _observer(config: Config, start: EnvState, traj: Trajectory) -> ppo.Apply:
+def _observer(
+    config: Config, start: EnvState, traj: Trajectory, spread: Spread = lambda index: index
+) -> ppo.Apply:
     """The networks at the observations of `traj`, named by their flat index t * N + n."""
     actor = _windows(start.history, traj.frame, traj.age)
     critic = _windows(start.privileged_history, traj.privileged, traj.age)
 
     def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array]:
+        index = spread(index)
         dist = networks.policy(config, params, actor(index))
         return dist, networks.value(config, params, critic(index))
 
@@ -173,10 +218,11 @@ def _windows(
 
 
 def _progress(out: Outcome) -> Progress:
-    """What the rollout says about the policy, for the curriculum."""
+    """What the rollout says about the policy, for the curriculum; broken steps say nothing."""
     done = out.terminated | out.truncated
 
     def mean_over(value: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mask = mask & ~out.broken
         count = jnp.sum(mask)
         return jnp.sum(value * mask) / jnp.maximum(count, 1), count
 
@@ -192,7 +238,8 @@ def _progress(out: Outcome) -> Progress:
 def _metrics(
     config: Config, state: TrainState, out: Outcome, progress: Progress, losses: Metrics
 ) -> Metrics:
-    """Scalars of one train step. `reward/...` are raw terms, before weights."""
+    """Scalars of one train step. `reward/...` are raw terms, before weights; `broken` is the share
+    of samples that were masked, `finite` is 1 while networks, optimiser and curriculum are."""
     terms = {f"reward/{name}": jnp.mean(value) for name, value in out.terms.items()}
     return {
         "step": state.step,
@@ -202,6 +249,7 @@ def _metrics(
         "episode_steps": state.curriculum.episode_steps,
         "falls": jnp.mean(out.terminated),
         "broken": jnp.mean(out.broken),
+        "finite": finite((state.learner, state.curriculum)).astype(jnp.float32),
         "speeding": jnp.mean(out.speeding),
         "curriculum/v_max": state.curriculum.v_max,
         "curriculum/cycle_time": state.curriculum.cycle_time,

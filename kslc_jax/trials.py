@@ -3,7 +3,8 @@ C MuJoCo at high fidelity. One code path for both: only the physics config diffe
 """
 
 import dataclasses
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import flax.struct
@@ -11,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import commands, env, physics, signals
+from kslc_jax import commands, env, observations, physics, signals
 from kslc_jax.checkpoint import Policy
-from kslc_jax.config import Config, PhysicsConfig, RandomizeConfig
+from kslc_jax.config import Config, HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.robot import Fidelity
 
 NOMINAL = RandomizeConfig(
     friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0
@@ -30,6 +32,12 @@ class Setting:
     seconds: float = 20.0
     noise: bool = False
     """Sensor noise, action delay and action noise as in training."""
+    latency: bool = False
+    """Every action comes one control step late."""
+    imu_offset: tuple[float, float] = (0.0, 0.0)
+    """Constant error of the roll and pitch that the policy sees [rad]."""
+    simulate: Callable[..., physics.PhysicsState] | None = None
+    """Another engine, with the signature of `physics.step`; None takes that of `physics`."""
 
 
 @flax.struct.dataclass
@@ -48,6 +56,11 @@ class Trace:
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
 
 
+def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
+    """The physics that the policy was trained in ("train") or the high-fidelity one."""
+    return HighFidelity() if fidelity == "high" else policy.config.physics
+
+
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
     """The policy's config under the setting's conditions: fixed commands, no time limit."""
     quiet = {} if setting.noise else {"noise_level": 0.0, "action_delay": 0.0, "action_noise": 0.0}
@@ -60,6 +73,20 @@ def trial_config(config: Config, setting: Setting, count: int) -> Config:
         command=dataclasses.replace(config.command, resample_seconds=seconds),
         ppo=dataclasses.replace(config.ppo, minibatches=1),
     )
+
+
+def hold(
+    config: Config, state: env.EnvState, velocity: jax.Array, heading: jax.Array | float = 0.0
+) -> env.EnvState:
+    """The environment under the command `velocity` [3]: vx, vy [m/s], yaw rate [rad/s].
+
+    A wanted yaw rate moves the heading ahead of the robot; without one it is `heading` [rad].
+    """
+    yaw = signals.read(physics.robot_for(config.physics), state.physics).base_euler[2]
+    ahead = yaw + velocity[2] / config.command.heading_gain
+    heading = jnp.where(velocity[2] == 0.0, heading, ahead)
+    command = commands.with_velocity(config.command, state.command, velocity)
+    return state.replace(command=command.replace(heading=heading))
 
 
 def run(
@@ -80,34 +107,38 @@ def run(
     key_reset, key_run = jax.random.split(jax.random.key(seed))
     keys = jax.random.split(key_reset, len(velocities))
     wanted = jnp.asarray(velocities, jnp.float32)
-
-    def hold(state: env.EnvState, velocity: jax.Array) -> env.EnvState:
-        """The wanted command; a wanted yaw rate moves the heading ahead of the robot."""
-        yaw = signals.read(robot, state.physics).base_euler[2]
-        ahead = yaw + velocity[2] / config.command.heading_gain
-        heading = jnp.where(velocity[2] == 0.0, 0.0, ahead)
-        command = commands.with_velocity(config.command, state.command, velocity)
-        return state.replace(command=command.replace(heading=heading))
+    step = functools.partial(env.step, simulate=setting.simulate) if setting.simulate else env.step
+    error = _frame_error(setting)
 
     def one(carry, key):
-        state, alive = carry
-        state = jax.vmap(hold)(state, wanted)
-        action = jax.vmap(policy.act_on)(state.history)
+        state, alive, last_action = carry
+        state = jax.vmap(lambda s, v: hold(config, s, v))(state, wanted)
+        action = jax.vmap(policy.act_on)(state.history + error)
+        sent = last_action if setting.latency else action
         step_keys = jax.random.split(key, len(velocities))
-        state, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(
-            config, state, action, step_keys, policy.curriculum
+        state, outcome = jax.vmap(step, (None, 0, 0, 0, None))(
+            config, state, sent, step_keys, policy.curriculum
         )
         alive = alive & ~outcome.terminated
-        return (state, alive), _record(robot, state, alive)
+        return (state, alive, action), _record(robot, state, alive)
 
     reset = jax.jit(jax.vmap(lambda k: env.reset(config, k, policy.curriculum)))
     advance = jax.jit(lambda carry, keys: jax.lax.scan(one, carry, keys))
-    carry = reset(keys), jnp.ones(len(velocities), bool)
+    states = reset(keys)
+    carry = states, jnp.ones(len(velocities), bool), states.last_action
     steps = round(chunk / config.control_dt)
     for i in range(round(setting.seconds / chunk)):
         step_keys = jax.random.split(jax.random.fold_in(key_run, i), steps)
         carry, trace = advance(carry, step_keys)
         yield jax.tree.map(np.asarray, trace)
+
+
+def _frame_error(setting: Setting) -> np.ndarray:
+    """What the setting's sensor errors add to every actor frame [59]."""
+    error = np.zeros(observations.ACTOR_WIDTH, np.float32)
+    at = observations.slices(observations.ACTOR)["base_euler"].start
+    error[at : at + 2] = setting.imu_offset
+    return error
 
 
 def _record(robot, state: env.EnvState, alive: jax.Array) -> Trace:

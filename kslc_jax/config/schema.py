@@ -20,6 +20,22 @@ def require(ok: bool, message: str) -> None:
         raise ConfigError(message)
 
 
+COUNTER = 2**31
+"""Steps, samples and seeds are 32-bit integers in the compiled train step."""
+
+
+def _check_numbers(name: str, value: object) -> None:
+    """Every number is finite, and every integer one that a shape can hold."""
+    if dataclasses.is_dataclass(value):
+        for f in dataclasses.fields(value):
+            _check_numbers(f"{name}.{f.name}".lstrip("."), getattr(value, f.name))
+    elif isinstance(value, tuple):
+        for part in value:
+            _check_numbers(name, part)
+    elif isinstance(value, int | float):
+        require(abs(value) < 2**62, f"{name}: {value} is out of bounds")
+
+
 def _check_range(name: str, value: Range) -> None:
     require(value[0] <= value[1], f"{name}: lower bound {value[0]} is above upper bound {value[1]}")
 
@@ -49,7 +65,7 @@ class PhysicsConfig:
         require(self.decimation >= 1, "physics.decimation must be at least 1")
         require(self.iterations >= 1, "physics.iterations must be at least 1")
         require(self.ls_iterations >= 1, "physics.ls_iterations must be at least 1")
-        require(self.threads >= 0, "physics.threads must be 0 (all cores) or more")
+        require(0 <= self.threads <= 1024, "physics.threads must lie in [0, 1024]; 0: all cores")
 
     @property
     def control_dt(self) -> float:
@@ -437,7 +453,19 @@ class Config:
     run: RunConfig = field(default=RunConfig(), compare=False)
 
     def __post_init__(self):
-        require(self.seed >= 0, "seed must not be negative")
+        _check_numbers("", self)
+        require(0 <= self.seed < COUNTER, "seed must not be negative, nor above 2^31")
+        for name, seconds in (
+            ("env.episode_seconds", self.env.episode_seconds),
+            ("command.resample_seconds", self.command.resample_seconds),
+            ("randomize.push_seconds", self.randomize.push_seconds or self.control_dt),
+        ):
+            steps = seconds / self.control_dt
+            require(0.5 < steps < COUNTER, f"{name}: {seconds} s are {steps:.2g} control steps")
+        require(
+            self.batch_size < COUNTER,
+            f"env.num_envs x ppo.rollout_steps: {self.batch_size} samples are more than 2^31",
+        )
         require(
             self.curriculum.cycle_min <= self.gait.cycle_time,
             "curriculum.cycle_min must not be above gait.cycle_time, where the cycle starts",

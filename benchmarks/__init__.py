@@ -1,0 +1,17 @@
+"""Speed, measured: python -m benchmarks.NAME --help, from the repository's root.
+
+| module | what it measures |
+| --- | --- |
+| `throughput` | a whole train step, and the physics ceiling above it |
+| `comparison` | whole trainings: ours, Brax, PureJaxRL's loop, rsl_rl on torch |
+| `parts` | where the time of a train step goes |
+| `compile_time` | first start and later starts |
+| `memory` | peak memory and speed over environments and frames |
+| `gpu` | all that matters on a machine with an accelerator, in one go |
+
+Each prints a table, and with `--json` keeps the numbers.
+"""
+
+from kslc_jax import runtime
+
+runtime.prepare()

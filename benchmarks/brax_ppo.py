@@ -1,0 +1,163 @@
+"""Brax's PPO, as released, on our environment and networks: a thin adapter.
+
+The loop, its storage and its loss are Brax's `ppo.train`; environment, engine, networks, batch,
+minibatches, epochs and coefficients are ours. What cannot be made the same:
+
+- it keeps two whole observation histories a sample, the one before and the one after the step;
+- it estimates advantages anew in every minibatch, with the critic of the moment, and normalises
+  them there, ours once for the whole batch;
+- it updates observation statistics that nothing uses here;
+- it has no curriculum, no masking of broken samples, and no metrics of reward terms: work that only
+  ours does.
+"""
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import brax.envs
+import jax
+import jax.numpy as jnp
+from brax.training import distribution
+from brax.training.agents.ppo import networks as brax_networks
+from brax.training.agents.ppo import train as brax_train
+from brax.training.networks import FeedForwardNetwork
+
+from kslc_jax import curriculum as curriculum_lib
+from kslc_jax import env, networks, observations
+from kslc_jax.config import NUM_JOINTS, Config
+
+
+class Adapter(brax.envs.Env):
+    """Our environment in Brax's terms. It restarts by itself, so Brax's wrapper must not."""
+
+    def __init__(self, config: Config):
+        self.config = config
+        self.curriculum = curriculum_lib.init(config)
+
+    def reset(self, rng: jax.Array) -> brax.envs.State:
+        key, key_reset = jax.random.split(rng)
+        state = env.reset(self.config, key_reset, self.curriculum)
+        zero = jnp.zeros(())
+        info = {"key": key, "truncation": zero, "episode_done": zero, "episode_metrics": {}}
+        return brax.envs.State(state, _observe(state), zero, zero, {}, info)
+
+    def step(self, state: brax.envs.State, action: jax.Array) -> brax.envs.State:
+        key, key_step = jax.random.split(state.info["key"])
+        new, out = env.step(self.config, state.pipeline_state, action, key_step, self.curriculum)
+        done = (out.terminated | out.truncated).astype(jnp.float32)
+        truncated = out.truncated.astype(jnp.float32)
+        info = {**state.info, "key": key, "truncation": truncated, "episode_done": done}
+        obs = _observe(new)
+        return state.replace(pipeline_state=new, obs=obs, reward=out.reward, done=done, info=info)
+
+    @property
+    def observation_size(self) -> Any:
+        frames = self.config.env.frames, self.config.env.privileged_frames
+        widths = observations.ACTOR_WIDTH, observations.CRITIC_WIDTH
+        return {"state": frames[0] * widths[0], "privileged_state": frames[1] * widths[1]}
+
+    @property
+    def action_size(self) -> int:
+        return NUM_JOINTS
+
+    @property
+    def backend(self) -> str:
+        return self.config.physics.engine
+
+
+def _observe(state: env.EnvState) -> dict[str, jax.Array]:
+    """Flat observations, as Brax wants them."""
+    history, privileged = state.history, state.privileged_history
+    return {"state": history.reshape(-1), "privileged_state": privileged.reshape(-1)}
+
+
+def _wrap(adapter: Adapter, **_: Any) -> brax.envs.Env:
+    return brax.envs.training.VmapWrapper(adapter)
+
+
+def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]:
+    """Our actor and critic behind Brax's interface."""
+
+    def stacked(obs: jax.Array, width: int) -> jax.Array:
+        return obs.reshape(*obs.shape[:-1], -1, width)
+
+    def policy(_, params, obs):
+        dist = networks.policy(config, params, stacked(obs["state"], observations.ACTOR_WIDTH))
+        return dist.mean, jnp.broadcast_to(jnp.exp(dist.log_std), dist.mean.shape)
+
+    def value(_, params, obs):
+        history = stacked(obs["privileged_state"], observations.CRITIC_WIDTH)
+        return networks.value(config, params, history)
+
+    def part(*names: str) -> Callable[[jax.Array], networks.Params]:
+        return lambda key: {name: networks.init(config, key)[name] for name in names}
+
+    def factory(*_: Any, **__: Any) -> brax_networks.PPONetworks:
+        return brax_networks.PPONetworks(
+            FeedForwardNetwork(part("actor", "log_std"), policy),
+            FeedForwardNetwork(part("critic"), value),
+            distribution.NormalDistribution(NUM_JOINTS),
+        )
+
+    return factory
+
+
+def make(config: Config, most_calls: int) -> Callable[[], None]:
+    """A function that trains one step of `ppo.train`, at most `most_calls` times.
+
+    `ppo.train` runs in a thread of its own and waits between steps, where it reports progress.
+    """
+    go, done = threading.Semaphore(0), threading.Semaphore(0)
+    failures: list[Exception] = []
+
+    def progress(*_: Any) -> None:
+        done.release()
+        go.acquire()
+
+    def train() -> None:
+        go.acquire()
+        try:
+            brax_train.train(
+                environment=Adapter(config),
+                wrap_env_fn=_wrap,
+                network_factory=_network_factory(config),
+                num_timesteps=most_calls * config.batch_size,
+                num_evals=most_calls + 1,
+                run_evals=False,
+                progress_fn=progress,
+                episode_length=config.episode_steps,
+                num_envs=config.env.num_envs,
+                unroll_length=config.ppo.rollout_steps,
+                batch_size=config.env.num_envs // config.ppo.minibatches,
+                num_minibatches=config.ppo.minibatches,
+                num_updates_per_batch=config.ppo.epochs,
+                discounting=config.ppo.gamma,
+                gae_lambda=config.ppo.lam,
+                clipping_epsilon=config.ppo.clip,
+                clipping_epsilon_value=config.ppo.clip,
+                vf_loss_coefficient=2.0 * config.ppo.value_coef,
+                entropy_cost=config.ppo.entropy_coef,
+                max_grad_norm=config.ppo.max_grad_norm,
+                learning_rate=config.ppo.learning_rate,
+                learning_rate_schedule="ADAPTIVE_KL",
+                learning_rate_schedule_min_lr=config.ppo.learning_rate_bounds[0],
+                learning_rate_schedule_max_lr=config.ppo.learning_rate_bounds[1],
+                desired_kl=config.ppo.desired_kl,
+                seed=config.seed,
+            )
+        except Exception as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=train, daemon=True)
+    thread.start()
+
+    def run() -> None:
+        go.release()
+        while not done.acquire(timeout=0.1):
+            if not thread.is_alive():
+                raise RuntimeError(f"Brax stopped within {most_calls} train steps") from (
+                    failures[0] if failures else None
+                )
+
+    return run

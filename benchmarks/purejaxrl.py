@@ -1,0 +1,78 @@
+"""Our train step in the shape of PureJaxRL's loop, from the same pieces.
+
+What differs: each step stores its whole observation histories, and each epoch flattens, shuffles
+and cuts the whole batch. The numbers that come out are the same.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from kslc_jax import curriculum as curriculum_lib
+from kslc_jax import networks, ppo, train_step
+from kslc_jax.config import Config
+from kslc_jax.ppo import Learner, Samples
+from kslc_jax.train_step import Metrics, TrainState
+
+Stored = tuple[Samples, jax.Array, jax.Array]
+"""Samples and the histories that were seen: [B, ...], [B, K, 59], [B, Kp, 89]."""
+
+
+def make(
+    config: Config,
+) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
+    """(init, step), as `train_step.make`."""
+    return train_step.make(config)[0], jax.jit(lambda s: step(config, s), donate_argnums=0)
+
+
+def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
+    """One rollout and one update."""
+    key_roll, key_update = train_step.step_keys(state)
+    params = state.learner.params
+
+    def one(envs, key):
+        new, traj = train_step.control_step(config, params, envs, state.curriculum, key)
+        new, outcome = jax.vmap(train_step.contain)(new, traj.outcome)
+        return new, (traj.replace(outcome=outcome), envs.history, envs.privileged_history)
+
+    start = jax.vmap(train_step.usable)(state.env)
+    keys = jax.random.split(key_roll, config.ppo.rollout_steps)
+    envs, (traj, *seen) = jax.lax.scan(one, start, keys)
+    last_value = networks.value(config, params, envs.privileged_history)
+    samples = train_step._samples(config, traj, last_value)
+    advantage = ppo._normalise(samples.advantage, samples.valid)
+    history, privileged = (x.reshape(-1, *x.shape[2:]) for x in seen)
+    stored = (samples.replace(advantage=advantage), history, privileged)
+    learner, losses = _update(config, state.learner, stored, key_update)
+    progress = train_step._progress(traj.outcome)
+    curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
+    new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
+    return new, train_step._metrics(config, new, traj.outcome, progress, losses)
+
+
+def _update(
+    config: Config, learner: Learner, stored: Stored, key: jax.Array
+) -> tuple[Learner, Metrics]:
+    """All epochs: shuffle everything, cut it, one gradient step on each piece."""
+    log_std = networks.log_std(config, learner.params)
+
+    def minibatch(learner: Learner, batch: Stored) -> tuple[Learner, Metrics]:
+        samples, history, privileged = batch
+
+        def apply(params, _):
+            dist = networks.policy(config, params, history)
+            return dist, networks.value(config, params, privileged)
+
+        return ppo.gradient_step(config.ppo, apply, log_std, learner, samples)
+
+    def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
+        order = jax.random.permutation(key, config.batch_size)
+        shuffled = jax.tree.map(lambda x: jnp.take(x, order, axis=0), stored)
+        pieces = jax.tree.map(
+            lambda x: x.reshape(config.ppo.minibatches, -1, *x.shape[1:]), shuffled
+        )
+        return jax.lax.scan(minibatch, learner, pieces)
+
+    learner, info = jax.lax.scan(epoch, learner, jax.random.split(key, config.ppo.epochs))
+    return learner, jax.tree.map(jnp.mean, info)

@@ -1,0 +1,329 @@
+"""A second, independent engine: Drake's SAP contact solver with hydroelastic feet.
+
+The plant takes its numbers from the compiled MuJoCo model (masses, frames, limits, shapes) and
+nothing of its dynamics. `step` has the signature of `physics.step`, so that a policy meets the same
+environment, signals and observations. MuJoCo only reads the kinematic sensors at Drake's state.
+
+Needs the package drake: pip install 'kslc_jax[drake]'.
+"""
+
+import copy
+import functools
+import logging
+import threading
+from dataclasses import dataclass
+
+import jax
+import mujoco
+import numpy as np
+from pydrake import geometry
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.geometry import GeometryId, SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    CoulombFriction,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    RevoluteJoint,
+    RotationalInertia,
+    SpatialInertia,
+)
+from pydrake.systems.framework import Context, Diagram, DiagramBuilder
+
+from kslc_jax import physics
+from kslc_jax.config import PhysicsConfig
+from kslc_jax.physics import PhysicsState
+from kslc_jax.randomize import Dynamics, model_fields
+from kslc_jax.robot import Robot
+
+SLAB = 0.1
+"""Depth [m] over which the floor's pressure rises from zero to `MODULUS`."""
+
+MODULUS = 1e7
+"""Pressure [Pa]: the standing robot sinks in by 0.2 mm."""
+
+DISSIPATION = 1.0
+"""Hunt-Crossley dissipation of the contact [s/m]."""
+
+FEET = ("left_foot", "right_foot")
+"""Geoms whose force on the floor is measured; the sensors are called after them."""
+
+KINEMATICS = (
+    mujoco.mj_kinematics,
+    mujoco.mj_comPos,
+    mujoco.mj_comVel,
+    mujoco.mj_subtreeVel,  # asked for by name: mj_sensorVel takes it to be up to date
+    mujoco.mj_sensorPos,
+    mujoco.mj_sensorVel,
+)
+"""Stages of MuJoCo after which its position and velocity sensors hold."""
+
+# It warns of deformable bodies, of which there are none, at every half space.
+logging.getLogger("drake").setLevel(logging.ERROR)
+
+_lock = threading.Lock()
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """One simulated robot with its parameters fixed; `context` and `data` are overwritten."""
+
+    robot: Robot
+    data: mujoco.MjData  # of the model that the plant was built from, for the kinematic sensors
+    diagram: Diagram
+    plant: MultibodyPlant
+    context: Context  # of the diagram
+    feet: tuple[GeometryId, ...]  # left and right
+    q_index: np.ndarray  # [23] where our qpos lies in Drake's positions
+    v_index: np.ndarray  # [22] where our qvel lies in Drake's velocities
+
+    @property
+    def plant_context(self) -> Context:
+        """The plant's part of `context`."""
+        return self.plant.GetMyContextFromRoot(self.context)
+
+
+# -------------------------------------------------------------------------------------- building
+
+
+def build(robot: Robot, model: mujoco.MjModel) -> World:
+    """The robot on a half space, with the parameters of `model` (the robot's, or a changed copy).
+
+    One friction for everything, that of the feet.
+    """
+    builder = DiagramBuilder()
+    settings = MultibodyPlantConfig(
+        time_step=model.opt.timestep,
+        contact_model="hydroelastic_with_fallback",
+        discrete_contact_approximation="sap",
+        use_sampled_output_ports=False,
+    )
+    plant, scene = AddMultibodyPlant(settings, builder)
+    _add_bodies(plant, robot, model)
+    ids = _add_shapes(plant, model, friction=float(model.geom(FEET[0]).friction[0]))
+    plant.mutable_gravity_field().set_gravity_vector(model.opt.gravity)
+    plant.Finalize()
+    _exclude(plant, scene, model)
+    diagram = builder.Build()
+    base = plant.GetBodyByName(model.body(robot.base_body_id).name)
+    joints = [plant.GetJointByName(name) for name in robot.joint_names]
+    q, v = base.floating_positions_start(), base.floating_velocities_start_in_v()
+    return World(
+        robot=robot,
+        data=mujoco.MjData(model),
+        diagram=diagram,
+        plant=plant,
+        context=diagram.CreateDefaultContext(),
+        feet=tuple(ids[name] for name in FEET),
+        # Drake: quaternion, position; rate, velocity. MuJoCo: the other way round.
+        q_index=np.r_[q + 4 : q + 7, q : q + 4, [j.position_start() for j in joints]],
+        v_index=np.r_[v + 3 : v + 6, v : v + 3, [j.velocity_start() for j in joints]],
+    )
+
+
+def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> None:
+    """Bodies, hinges and motors, in the robot's joint order.
+
+    The servos' damping goes into the joints, which Drake integrates implicitly as MuJoCo does.
+    """
+    for i in range(1, model.nbody):
+        plant.AddRigidBody(model.body(i).name, _inertia(model, i))
+    for name, servo_damping in zip(robot.joint_names, robot.kd, strict=True):
+        joint = model.joint(name)
+        child = model.body(int(joint.bodyid[0]))
+        parent = plant.GetBodyByName(model.body(int(child.parentid[0])).name)
+        hinge = RevoluteJoint(
+            name,
+            plant.AddFrame(FixedOffsetFrame(name, parent, RigidTransform(child.pos))),
+            plant.GetBodyByName(child.name).body_frame(),
+            joint.axis,
+            damping=joint.damping[0] + servo_damping,
+        )
+        hinge.set_position_limits(joint.range[:1], joint.range[1:])
+        motor = plant.AddJointActuator(name, plant.AddJoint(hinge))
+        motor.set_default_rotor_inertia(joint.armature[0])
+
+
+def _inertia(model: mujoco.MjModel, body: int) -> SpatialInertia:
+    """Mass and inertia of a body about its frame's origin."""
+    turn = RotationMatrix(Quaternion(model.body_iquat[body])).matrix()
+    central = turn @ np.diag(model.body_inertia[body]) @ turn.T
+    return SpatialInertia.MakeFromCentralInertia(
+        model.body_mass[body],
+        model.body_ipos[body],
+        RotationalInertia(*np.diag(central), central[0, 1], central[0, 2], central[1, 2]),
+    )
+
+
+def _add_shapes(
+    plant: MultibodyPlant, model: mujoco.MjModel, friction: float
+) -> dict[str, GeometryId]:
+    """Every geom that collides: rigid feet on a compliant floor, point contact for the rest."""
+    ids = {}
+    for i in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+        geom = model.geom(int(i))
+        body = plant.GetBodyByName(model.body(int(geom.bodyid[0])).name)
+        properties = geometry.ProximityProperties()
+        geometry.AddContactMaterial(
+            properties, dissipation=DISSIPATION, friction=CoulombFriction(friction, friction)
+        )
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geometry.AddCompliantHydroelasticPropertiesForHalfSpace(SLAB, MODULUS, properties)
+        elif geom.name in FEET:
+            geometry.AddRigidHydroelasticProperties(properties)
+        pose = RigidTransform(Quaternion(geom.quat), geom.pos)
+        ids[geom.name] = plant.RegisterCollisionGeometry(
+            body, pose, _shape(geom), geom.name, properties
+        )
+    return ids
+
+
+def _shape(geom) -> geometry.Shape:
+    """Drake's shape for a geom; MuJoCo gives half lengths."""
+    kind = mujoco.mjtGeom(int(geom.type[0]))
+    a, b, c = map(float, geom.size)
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_PLANE:
+            return geometry.HalfSpace()
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            return geometry.Box(2 * a, 2 * b, 2 * c)
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return geometry.Capsule(a, 2 * b)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            return geometry.Cylinder(a, 2 * b)
+        case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+            return geometry.Ellipsoid(a, b, c)
+    raise ValueError(f"geom {geom.name}: no Drake shape for {kind}")
+
+
+def _exclude(plant: MultibodyPlant, scene: SceneGraph, model: mujoco.MjModel) -> None:
+    """The pairs of bodies that the model lets overlap; both engines skip a body and its parent."""
+
+    def shapes_of(body: int) -> geometry.GeometrySet:
+        link = plant.GetBodyByName(model.body(body).name)
+        return geometry.GeometrySet(plant.GetCollisionGeometriesForBody(link))
+
+    for signature in model.exclude_signature:
+        one, other = divmod(int(signature), 1 << 16)
+        scene.collision_filter_manager().Apply(
+            geometry.CollisionFilterDeclaration().ExcludeBetween(shapes_of(one), shapes_of(other))
+        )
+
+
+# -------------------------------------------------------------------------------------- stepping
+
+
+def set_state(world: World, qpos: np.ndarray, qvel: np.ndarray) -> None:
+    """Puts the robot at `qpos` [23] with `qvel` [22], in MuJoCo's conventions."""
+    q, v = np.empty(len(qpos)), np.empty(len(qvel))
+    rate = np.empty(3)
+    mujoco.mju_rotVecQuat(rate, qvel[3:6], qpos[3:7])
+    q[world.q_index], v[world.v_index] = qpos, np.r_[qvel[:3], rate, qvel[6:]]
+    world.plant.SetPositionsAndVelocities(world.plant_context, np.r_[q, v])
+
+
+def get_state(world: World) -> tuple[np.ndarray, np.ndarray]:
+    """qpos [23] and qvel [22] in MuJoCo's conventions."""
+    qpos = world.plant.GetPositions(world.plant_context)[world.q_index]
+    qvel = world.plant.GetVelocities(world.plant_context)[world.v_index]
+    mujoco.mju_normalize4(qpos[3:7])
+    mujoco.mju_rotVecQuat(qvel[3:6], qvel[3:6].copy(), qpos[3:7] * [1, -1, -1, -1])
+    return qpos, qvel
+
+
+def advance(
+    world: World, state: PhysicsState, target: np.ndarray, dynamics: Dynamics, steps: int
+) -> PhysicsState:
+    """`steps` physics steps of one robot towards `target` [16, rad]; numpy in, numpy out.
+
+    A step that Drake gives up on leaves NaN, as a diverged one does in MuJoCo.
+    """
+    robot, motors = world.robot, world.plant.get_actuation_input_port()
+    joint_friction = world.data.model.dof_frictionloss[6:]
+    torque, forces = np.asarray(state.torque), np.zeros(len(world.feet))
+    try:
+        set_state(world, np.asarray(state.qpos), np.asarray(state.qvel))
+        for i in range(steps):
+            qpos, qvel = get_state(world)
+            q, dq = qpos[7:], qvel[6:]
+            torque = physics.motor_torque(robot, dynamics, q, dq, target, np)
+            passive = -joint_friction * np.tanh(dq / physics.FRICTION_SPEED)
+            motors.FixValue(world.plant_context, torque + passive + robot.kd * dq)
+            if i == steps - 1:
+                forces = foot_forces(world)
+            new = world.diagram.EvalUniquePeriodicDiscreteUpdate(world.context)
+            world.context.get_mutable_discrete_state().SetFrom(new)
+        qpos, qvel = get_state(world)
+    except (RuntimeError, SystemExit):  # the latter where Drake demands finite numbers
+        qpos, qvel = np.full(state.qpos.shape, np.nan), np.full(state.qvel.shape, np.nan)
+    sensordata = _sensordata(world, qpos, qvel, forces)
+    return state.replace(qpos=qpos, qvel=qvel, sensordata=sensordata, torque=torque)
+
+
+def foot_forces(world: World) -> np.ndarray:
+    """Normal force between each foot and the floor [2, N] in the present state."""
+    contacts = world.plant.get_contact_results_output_port().Eval(world.plant_context)
+    forces = np.zeros(len(world.feet))
+    for i in range(contacts.num_hydroelastic_contacts()):
+        contact = contacts.hydroelastic_contact_info(i)
+        surface = contact.contact_surface()
+        for shape in {surface.id_M(), surface.id_N()} & set(world.feet):
+            forces[world.feet.index(shape)] += abs(contact.F_Ac_W().translational()[2])
+    return forces
+
+
+def _sensordata(world: World, qpos: np.ndarray, qvel: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    """Drake's foot forces, and the sensors that follow from the state by MuJoCo's kinematics."""
+    model, data = world.data.model, world.data
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    for stage in KINEMATICS:
+        stage(model, data)
+    for name, force in zip(FEET, forces, strict=True):
+        data.sensordata[world.robot.sensor(f"{name}_touch")] = force
+    return data.sensordata.copy()
+
+
+def step(
+    config: PhysicsConfig,
+    state: PhysicsState,
+    target: jax.Array,
+    dynamics: Dynamics,
+    ground_friction: float,
+) -> PhysicsState:
+    """`physics.step` in Drake: one control step of one environment; vmapped ones take turns."""
+    fields = model_fields(physics.robot_for(config), dynamics, ground_friction)
+    like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+    call = functools.partial(_host_step, config)
+    return jax.pure_callback(call, like, state, target, dynamics, fields, vmap_method="sequential")
+
+
+def _host_step(
+    config: PhysicsConfig,
+    state: PhysicsState,
+    target: np.ndarray,
+    dynamics: Dynamics,
+    fields: dict[str, np.ndarray],
+) -> PhysicsState:
+    """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us."""
+    state, target, dynamics, fields = jax.tree.map(
+        lambda x: np.asarray(x, np.float64), (state, target, dynamics, fields)
+    )
+    changes = tuple((name, value.tobytes()) for name, value in fields.items())
+    with _lock:
+        new = advance(_world(config, changes), state, target, dynamics, config.decimation)
+    return jax.tree.map(lambda x: x.astype(np.float32), new)
+
+
+@functools.lru_cache(maxsize=64)
+def _world(config: PhysicsConfig, changes: tuple[tuple[str, bytes], ...]) -> World:
+    """The robot with some fields of its model changed."""
+    robot = physics.robot_for(config)
+    model = copy.copy(robot.mj_model)
+    for name, raw in changes:
+        field = getattr(model, name)
+        field[:] = np.frombuffer(raw).reshape(field.shape)
+    return build(robot, model)

@@ -1,0 +1,192 @@
+"""The viewer's controls: sliders, buttons, keys and plots. Knows no simulation."""
+
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import viser
+from viser.uplot import Axis, Legend, Scale, Series
+
+from kslc_jax.checkpoint import Policy
+from kslc_jax.config import CommandConfig
+from kslc_jax.session import View
+
+MARGIN = 0.5
+"""How far [m/s] the slider of vx goes backwards, and beyond the trained range."""
+
+SIDE_MARGIN = 0.2
+"""How far [m/s] the slider of vy goes beyond the trained range."""
+
+RATES = {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
+
+PLOT_SECONDS = 6.0
+PLOT_HEIGHT = 130
+"""Pixels."""
+
+STEP = np.array([0.25, 0.1, 0.2])
+"""What a key changes of vx, vy [m/s] and yaw rate [rad/s]."""
+
+# viser itself moves the camera with W A S D Q E and the arrow keys.
+WAYS = {
+    "I": ("Faster", (1, 0, 0)),
+    "K": ("Slower", (-1, 0, 0)),
+    "J": ("Turn left", (0, 0, 1)),
+    "L": ("Turn right", (0, 0, -1)),
+    "U": ("Step left", (0, 1, 0)),
+    "O": ("Step right", (0, -1, 0)),
+}
+ACTIONS = {"P": "Push", "space": "Pause", "R": "Reset", "X": "Stop"}
+
+HELP = """**I K** faster, slower; **J L** turn; **U O** step sideways; **X** stop; **P** push;
+**space** pause; **R** reset. **W A S D Q E** and the arrows move the camera."""
+
+BLUE, ORANGE, GREEN = "#2d6cdf", "#e8590c", "#2b8a3e"
+
+
+class Panel:
+    """What the user wants, and what is shown beside the picture."""
+
+    def __init__(self, server: viser.ViserServer, names: Sequence[str], config: CommandConfig):
+        """`names` of the policies to choose from; the trained ranges come from `config`."""
+        self.paused = False
+        self._reset_wanted, self._push_wanted = threading.Event(), threading.Event()
+        gui = server.gui
+        turn = max(config.max_yaw_rate, STEP[2])
+        gui.set_panel_label("kslc_jax")
+        gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self.status = gui.add_markdown("")
+        with gui.add_folder("Command"):
+            self._sliders = (
+                gui.add_slider("vx m/s", -MARGIN, MARGIN, 0.05, 0.0),
+                gui.add_slider(
+                    "vy m/s", config.vy[0] - SIDE_MARGIN, config.vy[1] + SIDE_MARGIN, 0.05, 0.0
+                ),
+                gui.add_slider("yaw rad/s", -turn, turn, 0.05, 0.0),
+            )
+            self._push = gui.add_slider("push m/s", 0.1, 2.0, 0.1, 0.5)
+            buttons = gui.add_button_group("", ("Push", "Pause", "Reset"))
+        with gui.add_folder("Show"):
+            self.follow = gui.add_checkbox("Follow", True)
+            self.rate = gui.add_dropdown("Playback", tuple(RATES), initial_value="1x")
+            self.policy = gui.add_dropdown("Policy", tuple(names), initial_value=names[0])
+        self._plots = _plots(gui)
+        with gui.add_folder("Keys", expand_by_default=False):
+            gui.add_markdown(HELP)
+        actions: dict[str, Callable[[], None]] = {
+            "Push": self._push_wanted.set,
+            "Pause": self._pause,
+            "Reset": self._reset_wanted.set,
+            "Stop": self._stop,
+        }
+        buttons.on_click(lambda event: actions[event.target.value]())
+        for key, label in ACTIONS.items():
+            _bind(gui, key, label, actions[label])
+        for key, (label, way) in WAYS.items():
+            _bind(gui, key, label, lambda way=way: self._change(STEP * way))
+
+    def _pause(self) -> None:
+        self.paused = not self.paused
+
+    def _stop(self) -> None:
+        for slider in self._sliders:
+            slider.value = 0.0
+
+    def _change(self, by: np.ndarray) -> None:
+        for slider, change in zip(self._sliders, by, strict=True):
+            if change:
+                wanted = round(slider.value + change, 6)
+                slider.value = float(np.clip(wanted, slider.min, slider.max))
+
+    def allow(self, fastest: float) -> None:
+        """Sets the range of vx for a policy trained up to `fastest` [m/s]."""
+        vx = self._sliders[0]
+        vx.value = min(vx.value, fastest + MARGIN)
+        vx.max = fastest + MARGIN
+        speed, _ = self._plots
+        speed.scales = _scales(-MARGIN, fastest + MARGIN)
+
+    @property
+    def command(self) -> np.ndarray:
+        """[3] vx, vy [m/s], yaw rate [rad/s]."""
+        return np.array([slider.value for slider in self._sliders])
+
+    def take_reset(self) -> bool:
+        """Whether a reset was asked for since the last call."""
+        wanted = self._reset_wanted.is_set()
+        self._reset_wanted.clear()
+        return wanted
+
+    def take_push(self, rng: np.random.Generator) -> np.ndarray | None:
+        """[2] m/s in a random direction if a push was asked for since the last call."""
+        if not self._push_wanted.is_set():
+            return None
+        self._push_wanted.clear()
+        angle = rng.uniform(0.0, 2.0 * np.pi)
+        return self._push.value * np.array([np.cos(angle), np.sin(angle)])
+
+    def plot(self, recent: Sequence[View], now: float, dt: float) -> None:
+        """Draws the latest views, `dt` [s] apart up to the time `now` [s]; every second one."""
+        views = recent[::-2][::-1]
+        if len(views) < 2:
+            return
+        rows = [
+            [now + 2 * dt * i, v.command[0], v.velocity[0], v.phase, *v.contact]
+            for i, v in enumerate(views, 1 - len(views))
+        ]
+        seconds, command, velocity, phase, left, right = np.array(rows, np.float64).T
+        speed, gait = self._plots
+        speed.data = (seconds, command, velocity)
+        gait.data = (seconds, phase, 1.2 + 0.6 * right, 2.2 + 0.6 * left)
+
+
+def _bind(gui: viser.GuiApi, key: Any, label: str, action: Callable[[], None]) -> None:
+    gui.add_command(label, hotkey=key).on_trigger(lambda _: action())
+
+
+def _scales(low: float, high: float) -> dict[str, Scale]:
+    """Seconds across, `low` to `high` upwards."""
+    return {"x": Scale(time=False), "y": Scale(range=(low, high))}
+
+
+def _plots(gui: viser.GuiApi) -> tuple[viser.GuiUplotHandle, viser.GuiUplotHandle]:
+    """Forward speed, and gait phase with foot contacts, over the last seconds."""
+    empty = np.zeros(2)
+    common: dict[str, Any] = {
+        "legend": Legend(live=False),
+        "height": PLOT_HEIGHT,
+        "padding": (12, 24, 0, 0),
+    }
+    speed = gui.add_uplot(
+        (empty,) * 3,
+        (
+            Series(),
+            Series(label="commanded vx [m/s]", stroke=BLUE, width=2),
+            Series(label="actual", stroke=ORANGE, width=1),
+        ),
+        scales=_scales(-MARGIN, MARGIN),
+        **common,
+    )
+    gait = gui.add_uplot(
+        (empty,) * 4,
+        (
+            Series(),
+            Series(label="gait phase", stroke=BLUE, width=1),
+            Series(label="right foot down", stroke=ORANGE, width=1),
+            Series(label="left foot down", stroke=GREEN, width=1),
+        ),
+        scales=_scales(0.0, 3.0),
+        axes=(Axis(), Axis(splits=(0.5, 1.5, 2.5), values=("phase", "right", "left"))),
+        **common,
+    )
+    return speed, gait
+
+
+def status(view: View, speed: float, factor: float, policy: Policy, paused: bool) -> str:
+    """The text above the controls, Markdown."""
+    how = "**fallen**" if view.fallen else "paused" if paused else "up"
+    return (
+        f"**{speed:z.2f} m/s** of {view.command[0]:.2f} commanded, {how}  \n"
+        f"real-time factor {factor:.2f}, train step {policy.step}, "
+        f"trained up to {float(policy.curriculum.v_max):.1f} m/s"
+    )

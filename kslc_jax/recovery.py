@@ -1,0 +1,158 @@
+"""Numbers gone bad: when a training goes back to a checkpoint, and what it leaves when it gives up.
+
+Single environments are `train_step`'s business: it masks them and starts them anew. This file is
+about what that cannot mend: updates that are never finite, parameters that are not.
+"""
+
+import json
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kslc_jax import config as config_lib
+from kslc_jax import train_step
+from kslc_jax.checkpoint import CheckpointError, first_line, host_array
+from kslc_jax.config import Config
+from kslc_jax.train_step import TrainState
+
+PATIENCE = 10
+"""Train steps in a row without one finite update, after which a training goes back."""
+
+ATTEMPTS = 3
+"""Times that it goes back to the same checkpoint before it gives up."""
+
+CAUTION = 0.5
+"""Factor on the learning rate at each of them."""
+
+DUMP = "bad_state.npz"
+"""File in the run folder: the state before the first bad train step of the last attempt."""
+
+
+class NumbersError(RuntimeError):
+    """Numbers that go bad however often the training goes back."""
+
+
+class WentBad(Exception):
+    """What is wrong, and the state before the first train step that had it."""
+
+    def __init__(self, why: str, before: TrainState):
+        super().__init__(why)
+        self.before = before
+
+
+class Health:
+    """Whether a training's numbers are good, from each train step's metrics."""
+
+    def __init__(self, state: TrainState):
+        self._bad_steps = 0
+        self._finite = True
+        self._before = state
+
+    @property
+    def good(self) -> bool:
+        """Whether the last train step was; only such states are worth saving."""
+        return self._bad_steps == 0
+
+    def before(self, state: TrainState) -> None:
+        """Keeps a copy, for the step donates `state`; during bad steps the one before them."""
+        if self.good:
+            self._before = jax.tree.map(jnp.copy, state)
+
+    def after(self, metrics: dict[str, float]) -> None:
+        """Counts bad train steps in a row."""
+        self._finite = metrics["finite"] == 1.0
+        learnt = metrics["ppo/skipped"] < 1.0
+        self._bad_steps = 0 if self._finite and learnt else self._bad_steps + 1
+
+    def check(self) -> None:
+        """WentBad where going on has no point."""
+        if not self._finite:
+            raise WentBad("the learner or the curriculum is not finite", self._before)
+        if self._bad_steps == PATIENCE:
+            raise WentBad(f"not one finite gradient in {PATIENCE} train steps", self._before)
+
+
+def persist(
+    config: Config,
+    run_dir: Path,
+    go: Callable[[TrainState], TrainState],
+    state: TrainState,
+    again: Callable[[], TrainState],
+    warn: Callable[[str], None],
+) -> TrainState:
+    """`go(state)`; where numbers go bad, once more, with caution, from the state of `again()`.
+
+    Raises:
+      NumbersError: it did not help; the message says what is left to look at.
+    """
+    attempt, back_to = 0, -1
+    while True:
+        try:
+            return go(state)
+        except WentBad as bad:
+            state = again()
+            attempt = attempt + 1 if int(state.step) == back_to else 1
+            back_to = int(state.step)
+            if attempt > ATTEMPTS:
+                left = _leave(config, run_dir / DUMP, bad.before)
+                raise NumbersError(
+                    f"{bad}, also after {ATTEMPTS} attempts from train step {back_to} with lower "
+                    f"learning rates; {left}"
+                ) from bad
+            state = cautious(state, attempt)
+            warn(
+                f"{bad}; back to train step {back_to} with learning rate "
+                f"{float(state.learner.learning_rate):.2g} (attempt {attempt} of {ATTEMPTS})"
+            )
+
+
+def _leave(config: Config, path: Path, state: TrainState) -> str:
+    """Writes the dump; says what to do with it."""
+    try:
+        dump(path, config, state)
+    except OSError as error:
+        return f"{path} could not be written ({error.strerror})"
+    return f"see where: python -m kslc_jax.doctor replay {shlex.quote(str(path))}"
+
+
+def cautious(state: TrainState, attempt: int) -> TrainState:
+    """`state` with a lower learning rate and, so that not all comes again, other random draws."""
+    rate = state.learner.learning_rate * CAUTION**attempt
+    key = jax.random.fold_in(state.key, attempt)
+    return state.replace(learner=state.learner.replace(learning_rate=rate), key=key)
+
+
+def dump(path: Path, config: Config, state: TrainState) -> None:
+    """Writes a state and its config as one npz, for `python -m kslc_jax.doctor replay`."""
+    arrays: dict[str, Any] = {
+        jax.tree_util.keystr(where): host_array(x) for where, x in jax.tree.leaves_with_path(state)
+    }
+    arrays["config"] = np.asarray(json.dumps(config_lib.to_dict(config)))
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def read_dump(path: Path) -> tuple[Config, TrainState]:
+    """Config and state of a dump; CheckpointError if it is none."""
+
+    def leaf(where: Any, like: jax.Array) -> jax.Array:
+        name = jax.tree_util.keystr(where)
+        x = jnp.asarray(arrays[name])
+        if jnp.issubdtype(like.dtype, jax.dtypes.prng_key):
+            x = jax.random.wrap_key_data(x)
+        if (x.shape, x.dtype) != (like.shape, like.dtype):
+            raise ValueError(f"{name} is {x.dtype}{x.shape}, not {like.dtype}{like.shape}")
+        return x
+
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            config = config_lib.from_dict(json.loads(str(arrays["config"])))
+            like = jax.eval_shape(lambda: train_step.init(config, 0))
+            return config, jax.tree.map_with_path(leaf, like)
+    except Exception as error:  # zip, JSON, config: whatever a wrong file leads to
+        raise CheckpointError(f"{path} is no dump of a training: {first_line(error)}") from error

@@ -1,0 +1,154 @@
+"""A robot to play with: one environment under a policy and a command that may change at any step.
+
+No window and no clock in here: `Session` steps, `Pacer` says how many steps are due.
+"""
+
+import functools
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from kslc_jax import env, maths, physics, signals, trials
+from kslc_jax.checkpoint import Policy
+from kslc_jax.config import Config, PhysicsConfig
+from kslc_jax.curriculum import Curriculum
+from kslc_jax.networks import Params
+
+FALLEN_SECONDS = 1.0
+"""How long a fallen robot lies there before it starts anew."""
+
+DAY = 86_400.0
+"""A session meets no time limit [s]."""
+
+
+@flax.struct.dataclass
+class View:
+    """What is shown of one control step. Feet: left, right."""
+
+    qpos: jax.Array  # [23]
+    command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
+    velocity: jax.Array  # [3] the same, as it is; base frame
+    phase: jax.Array  # [] share of the gait cycle
+    contact: jax.Array  # [2] bool
+    fallen: jax.Array  # [] bool
+
+
+@flax.struct.dataclass
+class Memory:
+    """What a session carries from step to step."""
+
+    env: env.EnvState
+    heading: jax.Array  # [] rad, kept while no yaw rate is wanted
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _reset(config: Config, curriculum: Curriculum, key: jax.Array) -> tuple[Memory, View]:
+    state = env.reset(config, key, curriculum)
+    return Memory(state, jnp.zeros(())), _view(config, state, jnp.zeros(3), jnp.zeros((), bool))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _advance(
+    config: Config,
+    params: Params,
+    curriculum: Curriculum,
+    memory: Memory,
+    command: jax.Array,
+    push: jax.Array,
+    key: jax.Array,
+    count: jax.Array,
+) -> tuple[Memory, View]:
+    """One control step; the view of a step that ended in a fall is the last one before it."""
+    qvel = memory.env.physics.qvel.at[:2].add(push)
+    pushed = memory.env.replace(physics=memory.env.physics.replace(qvel=qvel))
+    before = trials.hold(config, pushed, command, memory.heading)
+    action = Policy(config, params, curriculum, 0).act_on(before.history)
+    after, outcome = env.step(config, before, action, jax.random.fold_in(key, count), curriculum)
+    fallen = outcome.terminated
+    view = _view(config, maths.tree_where(fallen, before, after), command, fallen)
+    yaw = signals.read(physics.robot_for(config.physics), after.physics).base_euler[2]
+    heading = jnp.where(command[2] == 0.0, memory.heading, yaw)
+    return Memory(after, jnp.where(fallen, 0.0, heading)), view
+
+
+def _view(config: Config, state: env.EnvState, command: jax.Array, fallen: jax.Array) -> View:
+    now = signals.read(physics.robot_for(config.physics), state.physics)
+    return View(
+        qpos=state.physics.qpos,
+        command=command,
+        velocity=jnp.append(now.base_linvel[:2], now.base_angvel[2]),
+        phase=state.gait.phase,
+        contact=now.foot_contact,
+        fallen=fallen,
+    )
+
+
+class Session:
+    """A policy at play; `view` is the present."""
+
+    view: View
+
+    def __init__(self, policy: Policy, engine: PhysicsConfig, seed: int = 0):
+        self.policy = policy
+        self.dt = engine.control_dt
+        self._config = trials.trial_config(policy.config, trials.Setting(engine, seconds=DAY), 1)
+        self._key_reset, self._key_step = jax.random.split(jax.random.key(seed))
+        self._steps = self._resets = 0
+        self.reset()
+
+    def reset(self) -> View:
+        """A fresh episode."""
+        key = jax.random.fold_in(self._key_reset, self._resets)
+        self._resets += 1
+        memory, view = _reset(self._config, self.policy.curriculum, key)
+        # On a named device, like the loaded parameters: else the second step compiles once more.
+        self._memory = jax.device_put(memory, jax.devices()[0])
+        self._lies = 0.0
+        self.view = jax.device_get(view)
+        return self.view
+
+    def advance(self, command: np.ndarray, push: np.ndarray | None = None) -> View:
+        """One control step; after a fall the robot lies still for a second and starts anew.
+
+        Args:
+          command: [3] vx, vy [m/s], yaw rate [rad/s], base frame.
+          push: [2] sudden change of the base's velocity, world [m/s].
+        """
+        if self._lies > self.dt / 2:
+            self._lies -= self.dt
+            return self.view
+        self._memory, view = _advance(
+            self._config,
+            self.policy.params,
+            self.policy.curriculum,
+            self._memory,
+            np.asarray(command, np.float32),
+            np.asarray((0.0, 0.0) if push is None else push, np.float32),
+            self._key_step,
+            self._steps,
+        )
+        self._steps += 1
+        self.view = jax.device_get(view)
+        self._lies = FALLEN_SECONDS if self.view.fallen else 0.0
+        return self.view
+
+
+class Pacer:
+    """Tells how many steps of `dt` [s] are due, so that simulated time follows the clock."""
+
+    def __init__(self, dt: float, longest: float = 0.1):
+        """A simulation that cannot keep up drops what it is behind by more than `longest` [s]."""
+        self._dt, self._longest = dt, longest
+        self._last: float | None = None
+        self._owed = 0.0
+
+    def due(self, now: float, rate: float) -> int:
+        """Steps to do at the clock time `now` [s], at `rate` simulated seconds per second."""
+        elapsed = 0.0 if self._last is None else now - self._last
+        self._last = now
+        self._owed = min(self._owed + rate * elapsed, max(1.0, rate) * self._longest)
+        steps = int(self._owed / self._dt + 1e-6)
+        self._owed -= steps * self._dt
+        return steps

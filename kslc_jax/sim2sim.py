@@ -1,0 +1,219 @@
+"""Does a policy survive another simulator? python -m kslc_jax.sim2sim POLICY [--perturb all]
+
+Sweeps commanded forward speeds x seeds with the deterministic policy in full C MuJoCo (1 ms, PD
+torque at every step, elliptic cones, converged solver, self-collision, joint friction) or, with
+--engine drake, in Drake, whose contact model and solver are its own. Prints the table of
+kslc_jax.evaluate; --perturb repeats the sweep on a changed robot or ground. How to read it:
+docs/sim2sim.md.
+
+POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
+
+Examples:
+  python -m kslc_jax.sim2sim runs/laptop-seed0
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --noise --latency --perturb all --json out.json
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --perturb friction=0.2 payload=8 --speeds 1 2
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --engine drake --seconds 20 --seeds 2
+"""
+
+import dataclasses
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from kslc_jax import evaluate, runtime
+from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig
+
+PUSH_SECONDS = 4.0
+"""Time between pushes."""
+
+SHORTEST = 3.0
+"""Seconds below which nothing is left of a trial after the time to gather speed."""
+
+PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
+    "friction": lambda mu: {"friction": (mu, mu), "ground_friction": mu},
+    "payload": lambda kg: {"base_mass": (kg, kg)},
+    "push": lambda speed: {
+        "push_seconds": PUSH_SECONDS,
+        "push_velocity": speed,
+        "push_angular": 0.0,
+    },
+    "gains": lambda factor: {"kp": (factor, factor), "kd": (factor, factor)},
+    "strength": lambda factor: {"motor_strength": (factor, factor)},
+    "imu": lambda angle: {"imu_offset": (angle, angle)},
+}
+"""Name -> changes of RandomizeConfig or trials.Setting for a value."""
+
+ALL = (
+    *("friction=0.3", "friction=0.6", "friction=1.5"),
+    *("payload=-5", "payload=5", "push=0.5"),
+    *("gains=0.85", "gains=1.15", "strength=0.9", "imu=0.03"),
+)
+"""What `--perturb all` runs."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to try, and under what conditions."""
+
+    policy: tyro.conf.Positional[Path]
+    """Run folder, checkpoint folder, or name of a shipped policy."""
+    engine: Literal["mujoco", "drake"] = "mujoco"
+    """mujoco: C MuJoCo on all cores. drake: one robot at a time, slow, and needs the package drake
+    (pip install 'kslc_jax[drake]')."""
+    speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+    """Commanded forward speeds [m/s]."""
+    seeds: int = 32
+    """Trials per speed."""
+    seconds: float = 60.0
+    """Length of a trial."""
+    noise: bool = False
+    """Sensor noise, action delay and action noise as in training."""
+    latency: bool = False
+    """Every action comes one control step late."""
+    perturb: tuple[str, ...] = ()
+    """Repeat the sweep with each of these: friction=MU, payload=KG on the base, push=M/S (largest
+    push along x and y, every 4 s), gains=FACTOR on kp and kd, strength=FACTOR on the motors'
+    torque, imu=RAD (constant error of roll and pitch); all: a list of ten."""
+    seed: int = 0
+    """Of initial states."""
+    json: Path | None = None
+    """Where to keep the numbers."""
+
+    def __post_init__(self):
+        if self.seeds <= 0:
+            raise ConfigError("seeds must be positive")
+        if self.seconds < SHORTEST:
+            raise ConfigError(f"seconds must be at least {SHORTEST:g}")
+        if not self.speeds:
+            raise ConfigError("speeds: name at least one")
+        for name in self.conditions:
+            changes(name)
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """What to run, the unperturbed robot first."""
+        return ("nominal", *(ALL if self.perturb == ("all",) else self.perturb))
+
+
+def changes(condition: str) -> dict[str, Any]:
+    """What 'nominal' or a perturbation such as 'payload=5' changes; ConfigError if unknown."""
+    if condition == "nominal":
+        return {}
+    name, _, value = condition.partition("=")
+    try:
+        made = PERTURBATIONS[name](float(value))
+        RandomizeConfig(**{k: v for k, v in made.items() if k in _ROBOT})
+    except (KeyError, ValueError):
+        known = ", ".join(f"{name}=X" for name in PERTURBATIONS)
+        raise ConfigError(f"perturb: cannot read {condition!r} (known: {known}, all)") from None
+    return made
+
+
+_ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
+
+
+def setting(args: Args, condition: str):
+    """The conditions of one sweep, a `trials.Setting`."""
+    from kslc_jax import trials
+
+    simulate = None
+    if args.engine == "drake":
+        from kslc_jax import drake
+
+        simulate = drake.step
+    made = changes(condition)
+    robot = {name: value for name, value in made.items() if name in _ROBOT}
+    rest = {name: value for name, value in made.items() if name not in _ROBOT}
+    return trials.Setting(
+        HighFidelity(),
+        randomize=dataclasses.replace(trials.NOMINAL, **robot),
+        seconds=args.seconds,
+        noise=args.noise,
+        latency=args.latency,
+        simulate=simulate,
+        **rest,
+    )
+
+
+Results = dict[str, list[dict[str, float]]]
+
+
+def sweeps(args: Args, policy, progress=lambda condition, share: None) -> Results:
+    """Rows of `evaluate.measure` for every condition; `progress` is told where it is."""
+    return {
+        condition: evaluate.measure(
+            policy,
+            setting(args, condition),
+            args.speeds,
+            args.seeds,
+            args.seed,
+            lambda share, condition=condition: progress(condition, share),
+        )
+        for condition in args.conditions
+    }
+
+
+def summary(results: Results, title: str):
+    """Survival and mean speed of every condition and commanded speed, as a rich table."""
+    from rich.table import Table
+
+    out = Table(title=title, title_justify="left")
+    out.add_column("survived, mean vx [m/s]")
+    for row in results["nominal"]:
+        out.add_column(f"{row['command']:.1f}", justify="right")
+    for condition, rows in results.items():
+        cells = [f"{row['survival']:.0%} {row['forward_mean']:.2f}" for row in rows]
+        out.add_row(condition, *cells)
+    return out
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    runtime.prepare()
+    try:
+        args = tyro.cli(Args, args=argv, description=__doc__)
+        from rich.progress import Progress
+
+        from kslc_jax.checkpoint import CheckpointError, load_policy
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        setting(args, "nominal")
+        policy = load_policy(args.policy)
+    except ImportError as error:
+        print(f"error: {error}; try: pip install 'kslc_jax[drake]'", file=sys.stderr)
+        return 2
+    except (CheckpointError, ConfigError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    screen = evaluate.console()
+    # Reports come once a simulated second: the estimate of the time left needs a long memory.
+    with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
+        tasks = {name: bar.add_task(name, total=1.0, start=False) for name in args.conditions}
+
+        def progress(condition: str, share: float) -> None:
+            bar.start_task(tasks[condition])
+            bar.update(tasks[condition], completed=share)
+
+        results = sweeps(args, policy, progress)
+    title = f"{args.policy}, train step {policy.step}, {args.engine}"
+    for condition, rows in results.items():
+        screen.print(evaluate.table(rows, f"{title}, {condition}"))
+    if len(results) > 1:
+        screen.print(summary(results, title))
+    if args.json is not None:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        what = {"policy": str(args.policy), "step": policy.step}
+        how = {n: getattr(args, n) for n in ("engine", "seeds", "seconds", "noise", "latency")}
+        args.json.write_text(json.dumps({**what, **how, "conditions": results}, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,249 @@
+"""The live viewer: a robot in the browser, and a command to change while it runs.
+
+Needs viser (pip install 'kslc_jax[viewer]') and no GL: the browser draws.
+"""
+
+import collections
+import contextlib
+import errno
+import io
+import socket
+import time
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import trimesh
+import viser
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from kslc_jax import checkpoint, panel, trials
+from kslc_jax import robot as robot_lib
+from kslc_jax.checkpoint import CheckpointError, Policy, load_policy
+from kslc_jax.config import ConfigError
+from kslc_jax.robot import Fidelity
+from kslc_jax.session import Pacer, Session, View
+
+FPS = 30
+PANEL_HZ = 10
+"""Redraws of plots and status text per second."""
+
+GAMMA = 2.2
+"""glTF takes linear colours, MuJoCo shows its own as they are."""
+
+CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
+"""Where the camera starts and looks, relative to the robot [m], and its field of view [degrees]."""
+
+SPEED_SECONDS = 1.0
+"""Span over which the actual speed and the real-time factor are taken."""
+
+
+# -------------------------------------------------------------------------------------------- robot
+
+
+def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
+    """A primitive geom in its body's frame, in its material's colour."""
+    kinds, create = mujoco.mjtGeom, trimesh.creation
+    size = model.geom_size[geom]
+    kind = model.geom_type[geom]
+    if kind == kinds.mjGEOM_BOX:
+        shape = create.box(extents=2.0 * size)
+    elif kind == kinds.mjGEOM_CAPSULE:
+        shape = create.capsule(radius=size[0], height=2.0 * size[1])
+    elif kind == kinds.mjGEOM_CYLINDER:
+        shape = create.cylinder(radius=size[0], height=2.0 * size[1])
+    elif kind == kinds.mjGEOM_ELLIPSOID:
+        shape = create.icosphere(subdivisions=3).apply_scale(size)
+    elif kind == kinds.mjGEOM_SPHERE:
+        shape = create.icosphere(subdivisions=3, radius=size[0])
+    else:
+        raise ValueError(f"geom {model.geom(geom).name}: no picture of a {kinds(kind).name}")
+    placed = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
+    placed[:3, 3] = model.geom_pos[geom]
+    shape = trimesh.graph.smooth_shade(shape.apply_transform(placed))
+    rgba = model.mat_rgba[model.geom_matid[geom]].copy()
+    rgba[:3] **= GAMMA
+    paint = PBRMaterial(baseColorFactor=rgba, metallicFactor=0.0, roughnessFactor=0.7)
+    shape.visual = TextureVisuals(material=paint)
+    return shape
+
+
+class Figure:
+    """The robot and the floor in a viser scene.
+
+    With `follow` the world moves under a robot that stays in the picture, so that the user's camera
+    is left alone; without, the world stays where it is.
+    """
+
+    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
+        self._model, self._data = model, mujoco.MjData(model)
+        self.follow = True
+        self._server = server
+        scene = server.scene
+        scene.configure_environment_map("studio", environment_intensity=0.4)
+        server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
+        server.initial_camera.fov = np.radians(FOV)
+        self._world = scene.add_frame("/world", show_axes=False)
+        self._bodies = {}
+        for geom in range(model.ngeom):
+            body = int(model.geom_bodyid[geom])
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
+                self._add_floor(scene)
+                continue
+            name = f"/world/{model.body(body).name}"
+            if body not in self._bodies:
+                self._bodies[body] = scene.add_frame(name, show_axes=False)
+            glb = export_glb(mesh(model, geom), include_normals=True)
+            scene.add_glb(f"{name}/{geom}", glb)
+
+    @staticmethod
+    def _add_floor(scene: viser.SceneApi) -> None:
+        scene.add_grid(
+            "/world/floor",
+            infinite_grid=True,
+            cell_size=0.5,
+            cell_color=(214, 218, 224),
+            section_size=1.0,
+            section_color=(176, 182, 192),
+            fade_distance=40.0,
+            plane_color=(236, 238, 241),
+            plane_opacity=1.0,
+            shadow_opacity=0.3,
+        )
+
+    def show(self, view: View) -> None:
+        """Puts every body where the view has it."""
+        qpos = np.asarray(view.qpos)
+        self._data.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, self._data)
+        with self._server.atomic():
+            if self.follow:
+                self._world.position = (-qpos[0], -qpos[1], 0.0)
+            for body, frame in self._bodies.items():
+                frame.position = self._data.xpos[body]
+                frame.wxyz = self._data.xquat[body]
+
+
+# ------------------------------------------------------------------------------------------- viewer
+
+
+def policies(given: Path) -> dict[str, Path]:
+    """Name to folder: the given policy, its run's other checkpoints, and the shipped ones."""
+    folder = checkpoint._checkpoint_folder(given)
+    found = {str(given): folder}
+    others = [p for p in folder.parent.iterdir() if p.name.isdigit() and p != folder]
+    for other in sorted(others, key=lambda p: -int(p.name)):
+        found[f"step {other.name}"] = other
+    for shipped in sorted(checkpoint.POLICIES.glob("*/")):
+        found.setdefault(shipped.name, shipped)
+    return found
+
+
+def serve(host: str, port: int) -> viser.ViserServer:
+    """A web server at exactly this address; ConfigError if it cannot be had (0: any free port)."""
+    try:
+        # viser would quietly take the next free port, and never return from an unknown host.
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        socket.create_server((host, port), family=family).close()
+    except OSError as error:
+        in_use = error.errno == errno.EADDRINUSE
+        why = "the port is in use, give another with --port" if in_use else error.strerror
+        raise ConfigError(f"cannot serve at {host}:{port}: {why}") from error
+    with contextlib.redirect_stdout(io.StringIO()):  # its banner
+        return viser.ViserServer(host, port, verbose=False)
+
+
+class Viewer:
+    """Shows one robot to every browser that opens the page."""
+
+    def __init__(
+        self,
+        policy: Path,
+        fidelity: Fidelity = "high",
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        seed: int = 0,
+    ):
+        """Loads the policy and serves the page; nothing moves before `run`."""
+        self._fidelity: Fidelity = fidelity
+        self._seed = seed
+        self._policies = policies(policy)
+        self._name = next(iter(self._policies))
+        loaded = load_policy(policy)
+        self.server = serve(host, port)
+        self.figure = Figure(self.server, robot_lib.load(fidelity).mj_model)
+        self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
+        self._rng = np.random.default_rng(seed)
+        self._play(loaded)
+
+    def _play(self, policy: Policy) -> None:
+        """A new session with this policy."""
+        self.session = Session(policy, trials.engine(policy, self._fidelity), self._seed)
+        self.session.advance(np.zeros(3))  # compiles
+        self.panel.allow(float(policy.curriculum.v_max))
+        self._pacer = Pacer(self.session.dt)
+        shown = round(panel.PLOT_SECONDS / self.session.dt)
+        self._recent: collections.deque[View] = collections.deque(maxlen=shown)
+        self._paced = collections.deque([(0.0, 0.0)], maxlen=round(SPEED_SECONDS * FPS))
+        self._drawn = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Starts the robot anew."""
+        self.session.reset()
+        self._recent.clear()
+        self.figure.show(self.session.view)
+
+    def _switch(self, name: str) -> None:
+        """Plays the policy of this name; where it cannot be loaded, says so and plays on."""
+        self._name = name
+        self.panel.status.content = f"loading {name} ..."
+        try:
+            self._play(load_policy(self._policies[name]))
+        except CheckpointError as error:
+            for client in self.server.get_clients().values():
+                client.add_notification("Not loaded", str(error), color="red")
+
+    def frame(self, now: float) -> None:
+        """Simulates what is due at the clock time `now` [s] and draws it."""
+        if self.panel.policy.value != self._name:
+            self._switch(self.panel.policy.value)
+        if self.panel.take_reset():
+            self.reset()
+        idle = self.panel.paused or not self.server.get_clients()
+        steps = self._pacer.due(now, 0.0 if idle else panel.RATES[self.panel.rate.value])
+        for _ in range(steps):
+            push = self.panel.take_push(self._rng)
+            self._recent.append(self.session.advance(self.panel.command, push))
+        self._paced.append((now, self._paced[-1][1] + steps * self.session.dt))
+        if steps:
+            self.figure.follow = self.panel.follow.value
+            self.figure.show(self.session.view)
+        if now - self._drawn >= 1.0 / PANEL_HZ:
+            self._drawn = now
+            self._report()
+
+    def _report(self) -> None:
+        """Plots and status text."""
+        (began, start), (now, end) = self._paced[0], self._paced[-1]
+        self.panel.plot(list(self._recent), end, self.session.dt)
+        last = [v.velocity[0] for v in self._recent][-round(SPEED_SECONDS / self.session.dt) :]
+        self.panel.status.content = panel.status(
+            self.session.view,
+            speed=float(np.mean(last)) if last else 0.0,
+            factor=(end - start) / max(now - began, 1e-6),
+            policy=self.session.policy,
+            paused=self.panel.paused,
+        )
+
+    def run(self) -> None:
+        """Serves until it is interrupted."""
+        try:
+            while True:
+                began = time.monotonic()
+                self.frame(began)
+                time.sleep(max(0.0, began + 1.0 / FPS - time.monotonic()))
+        finally:
+            self.server.stop()

@@ -1,0 +1,272 @@
+"""What a person may get wrong at every command line: exit code 2, a line that names it, no
+traceback, and nothing on disk touched."""
+
+import contextlib
+import copy
+import io
+import json
+import string
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from kslc_jax import checkpoint, doctor, evaluate, play, plots, train, train_step
+from kslc_jax.config import PRESETS, preset, to_dict
+
+few = settings(
+    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+words = st.text(string.ascii_letters, min_size=4, max_size=8).filter(
+    lambda w: w.lower() != "infinity"
+)
+
+
+def refused(main, *argv: Any) -> str:
+    """What stderr says of a command line that is refused."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            code = main([str(a) for a in argv])
+        except SystemExit as stop:  # tyro's way
+            code = stop.code
+    said = err.getvalue()
+    assert code == 2 and "Traceback" not in said
+    if said.startswith("error: "):  # else it is a box of tyro's
+        assert len(said.splitlines()) == 1
+    return said
+
+
+@pytest.fixture(autouse=True)
+def no_training(monkeypatch):
+    """A train step that cannot run: accepting bad input shows as an AttributeError."""
+    monkeypatch.setattr(
+        train_step, "make", lambda config: (lambda: train_step.init(config, config.seed), None)
+    )
+
+
+@pytest.fixture
+def run_dir(tmp_path):
+    """A folder whose name is not easy, with a config that can be damaged."""
+    folder = tmp_path / "läuft gut 机器人 'x'"
+    folder.mkdir()
+    return folder
+
+
+# ----------------------------------------------------------------------------------------- options
+
+SIZES = ["env.num-envs", "ppo.rollout-steps", "env.frames", "env.privileged-frames"]
+COUNTS = [*SIZES, "ppo.minibatches", "ppo.epochs", "run.steps", "run.keep", "physics.decimation"]
+FLOATS = [
+    *("ppo.gamma", "env.episode-seconds", "gait.cycle-time", "rewards.weights.joint-pos"),
+    *("physics.timestep", "command.resample-seconds", "run.checkpoint-minutes", "env.action-scale"),
+]
+
+
+class TestTrain:
+    def refused(self, folder: Path, *argv: Any) -> str:
+        said = refused(train.main, "--preset", "debug", "--run-dir", folder / "new", *argv)
+        assert not (folder / "new").exists()
+        return said
+
+    @few
+    @given(st.sampled_from(COUNTS), st.integers(-(2**70), 0))
+    def test_no_positive_count(self, run_dir, name, value):
+        assert name.replace("-", "_") in self.refused(run_dir, f"--{name}", value)
+
+    @few
+    @given(st.sampled_from([*SIZES, "network.actor"]), st.integers(2**34, 2**70))
+    def test_sizes_beyond_any_memory(self, run_dir, name, value):
+        said = self.refused(run_dir, f"--{name}", 2 * value)
+        assert name.replace("-", "_") in said or "network sizes" in said
+
+    @few
+    @given(st.sampled_from(FLOATS), st.sampled_from(["nan", "inf", "-inf", "1e300"]))
+    def test_floats_out_of_bounds(self, run_dir, name, value):
+        assert name.replace("-", "_") in self.refused(run_dir, f"--{name}={value}")
+
+    @few
+    @given(st.sampled_from([*COUNTS, *FLOATS, "network.actor"]), words)
+    def test_words_for_numbers(self, run_dir, name, word):
+        assert f"--{name}" in self.refused(run_dir, f"--{name}", word)
+
+    @few
+    @given(words.filter(lambda w: w not in PRESETS and w != "auto"))
+    def test_unknown_names(self, run_dir, word):
+        assert word in refused(train.main, "--preset", word, "--run-dir", run_dir / "new")
+        assert word in self.refused(run_dir, "--without", word)
+        assert word in self.refused(run_dir, f"--{word}", "1")
+        assert word in self.refused(run_dir, "--physics.engine", word)
+
+    def test_impossible_folder(self, tmp_path):
+        folder = tmp_path / ("x" * 300)
+        assert "cannot write" in refused(train.main, "--preset", "debug", "--run-dir", folder)
+        assert "cannot read" in refused(train.main, "--resume", "--run-dir", folder)
+
+    def test_seed_beyond_the_counter(self, run_dir):
+        assert "seed" in self.refused(run_dir, "--seed", 2**40)
+
+
+# ---------------------------------------------------------------------------------- stored configs
+
+
+def places(tree: dict[str, Any], at: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Paths to every value of nested dicts."""
+    for name, value in tree.items():
+        yield (*at, name)
+        if isinstance(value, dict):
+            yield from places(value, (*at, name))
+
+
+STORED = to_dict(preset("debug"))
+
+
+class TestStoredConfig:
+    def refused(self, folder: Path, content: bytes) -> str:
+        path = folder / "config.json"
+        path.write_bytes(content)
+        said = refused(train.main, "--resume", "--run-dir", folder)
+        assert path.read_bytes() == content and list(folder.iterdir()) == [path]
+        return said
+
+    @settings(few, max_examples=30)
+    @given(st.sampled_from(sorted(places(STORED))), st.sampled_from([None, {}, [[]], "word"]))
+    def test_wrong_type(self, run_dir, where, junk):
+        data = copy.deepcopy(STORED)
+        inner = data
+        for name in where[:-1]:
+            inner = inner[name]
+        inner[where[-1]] = junk
+        said = self.refused(run_dir, json.dumps(data).encode())
+        assert where[-1] in said or junk == {}  # {}: the first missing field is named
+
+    @settings(few, max_examples=30)
+    @given(st.sampled_from(sorted(places(STORED))))
+    def test_unknown_field(self, run_dir, where):
+        data = copy.deepcopy(STORED)
+        inner = data
+        for name in where[:-1]:
+            inner = inner[name]
+        inner[f"{where[-1]}x"] = inner.pop(where[-1])
+        assert where[-1] in self.refused(run_dir, json.dumps(data).encode())
+
+    @settings(few, max_examples=30)
+    @given(st.binary(max_size=40) | st.sampled_from([b"", b"[]", b"1", b"null", b"[" * 10**5]))
+    def test_no_json(self, run_dir, content):
+        assert "config" in self.refused(run_dir, content)
+
+    @settings(few, max_examples=30)
+    @given(st.integers(0, len(json.dumps(STORED)) - 1))
+    def test_cut_off(self, run_dir, length):
+        said = self.refused(run_dir, json.dumps(STORED).encode()[:length])
+        assert "config.json is damaged" in said
+
+
+# ------------------------------------------------------------------------------- the other commands
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    """A run folder with one checkpoint of zeros, under a path with a space and beyond ASCII."""
+    config = preset("debug")
+
+    def zeros(x):
+        is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        return jax.random.key(0) if is_key else jnp.zeros(x.shape, x.dtype)
+
+    state = jax.tree.map(zeros, jax.eval_shape(lambda: train_step.init(config, 0)))
+    folder = tmp_path_factory.mktemp("run ünïcode 机器人")
+    with contextlib.closing(checkpoint.Store(folder)) as store:
+        metrics = {"score": 0.0, "step": 0, "curriculum/v_max": 0.5, "curriculum/cycle_time": 0.64}
+        store.save(state, config, metrics)
+    return folder
+
+
+def test_policy_loads_from_a_path_with_anything_in_it(policy):
+    assert checkpoint.load_policy(policy).config == preset("debug")
+
+
+PICTURE = ("--gait-strip", "strip.png")
+COMMANDS = [(evaluate.main, ()), (play.main, PICTURE)]
+
+
+@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=["evaluate", "play"])
+class TestPolicyCommands:
+    @pytest.fixture(autouse=True)
+    def any_renderer(self, monkeypatch):
+        """None is reached, so that it does not matter which this machine has."""
+        monkeypatch.setenv("MUJOCO_GL", "egl")
+
+    @few
+    @given(word=words)
+    def test_words_for_numbers(self, main, more, policy, word):
+        for name in ("speeds", "seconds", "seed"):
+            assert f"--{name}" in refused(main, policy, *more, f"--{name}", word)
+
+    @pytest.mark.parametrize("value", [0, -1, "nan", "inf"])
+    def test_seconds(self, main, more, policy, value):
+        assert "seconds" in refused(main, policy, *more, f"--seconds={value}")
+
+    def test_no_speeds(self, main, more, policy):
+        assert "speeds" in refused(main, policy, *more, "--speeds")
+
+    def test_speed_is_no_number(self, main, more, policy):
+        assert "speeds" in refused(main, policy, *more, "--speeds", "1.0", "nan")
+
+    def test_nothing_there(self, main, more, tmp_path):
+        missing = tmp_path / "nicht da 空"
+        assert str(missing) in refused(main, missing, *more)
+
+    def test_no_policy(self, main, more, tmp_path):
+        (tmp_path / "params").mkdir()
+        (tmp_path / "params" / "x").write_bytes(b"\x80\x04junk")
+        assert str(tmp_path) in refused(main, tmp_path, *more)
+
+
+class TestPlots:
+    def rows(self, folder: Path, content: bytes) -> Path:
+        (folder / "metrics.jsonl").write_bytes(content)
+        return folder
+
+    @few
+    @given(st.binary(max_size=40))
+    def test_no_metrics(self, run_dir, content):
+        folder = self.rows(run_dir, content)
+        out = run_dir / "curve.png"
+        said = refused(plots.main, "training", folder, "--out", out)
+        assert str(folder) in said and not out.exists()
+
+    @pytest.mark.parametrize("content", [b"1\n", b"{}\n", b'{"curriculum/v_max": "x"}\n'])
+    def test_other_json(self, run_dir, content):
+        folder = self.rows(run_dir, content)
+        assert str(folder) in refused(plots.main, "training", folder, "--out", run_dir / "c.png")
+
+    def test_nowhere_to_write(self, run_dir):
+        columns = ["step", "env_steps", "seconds", *(name for name, _, _ in plots.PANELS)]
+        row = json.dumps(dict.fromkeys(columns, 1.0)).encode()
+        folder = self.rows(run_dir, row + b"\n" + row + b"\n")
+        out = folder / "metrics.jsonl" / "curve.png"
+        assert str(out.parent) in refused(plots.main, "training", folder, "--out", out)
+
+
+class TestDoctor:
+    @few
+    @given(st.binary(max_size=40))
+    def test_no_dump(self, run_dir, content):
+        (run_dir / "d.npz").write_bytes(content)
+        assert str(run_dir / "d.npz") in refused(doctor.main, "replay", run_dir / "d.npz")
+
+    def test_dump_of_something_else(self, run_dir):
+        np.savez(run_dir / "d.npz", config=np.asarray(json.dumps(STORED)), x=np.zeros(3))
+        assert str(run_dir / "d.npz") in refused(doctor.main, "replay", run_dir / "d.npz")
+
+    def test_options(self, run_dir):
+        assert "steps" in refused(doctor.main, "replay", run_dir / "d.npz", "--steps", 0)
+        assert "steps" in refused(doctor.main, "replay", run_dir / "d.npz", "--steps", "few")
+        assert "diagnose" in refused(doctor.main, "diagnose")

@@ -1,0 +1,175 @@
+"""The benchmarks: that both sides do the same work, and that all of them run."""
+
+import json
+import subprocess
+import sys
+import tarfile
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import kslc_jax
+from benchmarks import compile_time, gpu, memory, parts, purejaxrl, throughput, timing
+from kslc_jax import observations, physics, randomize, signals, train_step
+from kslc_jax.config import preset
+
+
+def test_runs_take_turns_and_first_calls_do_not_count(monkeypatch):
+    clock, calls = [0.0], []
+
+    def run(name, seconds):
+        calls.append(name)
+        clock[0] += 100.0 if calls.count(name) == 1 else seconds * calls.count(name)
+
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock[0])
+    seconds = timing.in_turn({"a": lambda: run("a", 1.0), "b": lambda: run("b", 2.0)}, 3)
+    assert calls == ["a", "b"] * 4
+    assert seconds == {"a": [2.0, 3.0, 4.0], "b": [4.0, 6.0, 8.0]}
+    assert timing.medians(seconds) == {"a": 3.0, "b": 6.0}
+
+
+def test_parts_add_up():
+    programs = ("physics", "rollout", "samples", "update", "update without windows", "whole")
+    seconds = dict(zip(programs, (1.0, 1.5, 0.1, 2.0, 1.2, 4.0), strict=True))
+    split = parts.split(seconds)
+    assert split == pytest.approx(
+        dict(zip(parts.PARTS, (1.0, 0.5, 0.1, 0.8, 1.2), strict=True))
+        | {"unaccounted": 0.4, "whole": 4.0}
+    )
+
+
+def test_ratios_are_of_each_turn():
+    from benchmarks import comparison
+
+    seconds = {"kslc_jax": [1.0, 2.0, 4.0], "other": [3.0, 4.0, 4.0]}
+    rows = comparison.summary(seconds, batch=100)
+    assert rows["other"] == {"steps_per_second": 25.0, "times_slower": 2.0, "range": [1.0, 3.0]}
+    assert rows["kslc_jax"]["times_slower"] == 1.0
+
+
+def test_purejaxrls_loop_learns_the_same(debug):
+    """Stored and shuffled observations, or windows gathered from frames: the same parameters."""
+    ours, theirs = train_step.make(debug), purejaxrl.make(debug)
+    for init, step in (ours, theirs):
+        state = init()
+        for _ in range(2):
+            state, metrics = step(state)
+        if step is ours[1]:
+            expected = state.learner.params, metrics
+    for a, b in zip(
+        jax.tree.leaves((state.learner.params, metrics)), jax.tree.leaves(expected), strict=True
+    ):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_gym_environment_is_the_same_robot(debug):
+    """Physics, motors and frames of the hand-written environment equal ours."""
+    pytest.importorskip("gymnasium", reason="an extra, needed by one benchmark only")
+    from benchmarks.gym_env import XBot
+
+    config = timing.on_engine(debug, "mujoco")
+    env = XBot(config, seed=1)
+    env._noise[:] = 0.0
+    env.reset()
+    sole = env.model.geom_friction[env.robot.foot_geom_ids[0], 0]
+    ground = config.randomize.ground_friction
+    nominal = randomize.nominal(friction=2.0 * sole - ground)
+    state = physics.initial_state(
+        config.physics, jnp.asarray(env.data.qpos), jnp.asarray(env.data.qvel)
+    )
+    step = jax.jit(lambda s, target: physics.step(config.physics, s, target, nominal, ground))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        target = env.robot.default_qpos[7:] + 0.3 * rng.standard_normal(16)
+        env.simulate(target)
+        state = step(state, jnp.asarray(target, jnp.float32))
+    np.testing.assert_allclose(env.data.qpos, state.qpos, atol=1e-4)
+
+    env.action = rng.standard_normal(16)
+    env.data.qpos[:], env.data.qvel[:] = state.qpos, state.qvel
+    env.data.sensordata[:] = state.sensordata
+    env._read()
+    sources = observations.Sources(
+        signals=signals.read(env.robot, state),
+        gait=SimpleNamespace(clock=env.clock, stance=jnp.asarray(env.stance)),
+        command=SimpleNamespace(velocity=env.command),
+        dynamics=SimpleNamespace(friction=jnp.ones(())),
+        reference=env.reference,
+        last_action=env.action,
+        push=jnp.zeros(5),
+        base_mass=jnp.asarray(env.model.body_mass[env.robot.base_body_id]),
+    )
+    frames = env._observe()
+    actor = observations._frame(observations.ACTOR, sources)
+    np.testing.assert_allclose(frames["policy"][-1], actor, atol=1e-5)
+    critic = observations.critic_frame(config.env, sources)
+    np.testing.assert_allclose(frames["critic"][-1], critic, atol=1e-5)
+
+
+def test_throughput(tmp_path):
+    """Physics alone is faster than the rollout, and that than training."""
+    path = tmp_path / "numbers.json"
+    throughput.main(throughput.Args(preset="debug", repeats=3, engines=("mujoco",), json=path))
+    rates = json.loads(path.read_text())["steps_per_second"]["mujoco"]
+    assert rates["physics only"] > rates["rollout"] > rates["whole training"] > 10
+
+
+@pytest.mark.slow(reason="compiles six programs")
+def test_parts(tmp_path):
+    out, path = tmp_path / "parts.png", tmp_path / "parts.json"
+    parts.main(parts.Args(preset="debug", engines=("mujoco",), out=out, json=path))
+    seconds = json.loads(path.read_text())["seconds"]["mujoco"]
+    assert out.stat().st_size > 10_000
+    assert seconds["whole"] == pytest.approx(sum(seconds.values()) - seconds["whole"])
+    assert seconds["physics"] > 0 and seconds["gradient steps"] > 0
+
+
+@pytest.mark.slow(reason="starts Python four times")
+def test_compile_time_and_memory(tmp_path):
+    path = tmp_path / "numbers.json"
+    compile_time.main(compile_time.Args(presets=("debug",), engines=("mujoco",), json=path))
+    phases = json.loads(path.read_text())["seconds"]["debug, mujoco"]
+    assert phases["cold"]["compile"] > phases["cold"]["first step"] > 0
+    assert phases["warm"].keys() == phases["cold"].keys()
+
+    out = tmp_path / "memory.png"
+    memory.main(memory.Args("debug", (16, 4096), (3,), out=out, json=path))
+    small, large = json.loads(path.read_text())["points"]
+    assert large["peak_mib"] > small["peak_mib"] > small["before_mib"] > 50
+    assert large["estimated_mib"] > 100 * small["estimated_mib"]
+    assert out.stat().st_size > 10_000
+
+
+@pytest.mark.slow(reason="compiles MJX, a minute or two on two cores")
+def test_gpu_in_small(tmp_path):
+    """All of it on any machine; what it leaves is small, loads as a policy, and trains on."""
+    gpu.main(gpu.Args(tmp_path / "go1", tiny=True))
+    result = json.loads((tmp_path / "go1" / "results.json").read_text())
+    assert set(result["num_envs"]) == {"16", "32"} and result["precision"]["float32"] > 0
+    assert all(r["whole training"] > 0 for r in result["num_envs"].values())
+    assert result["training"]["steps"] == 2
+    kept = tmp_path / "go1" / "checkpoint.tgz"
+    with tarfile.open(kept) as file:
+        file.extractall(tmp_path, filter="data")
+    assert kslc_jax.load_policy(tmp_path / "2").config == timing.on_engine(preset("debug"), "mjx")
+    again = gpu.Args(tmp_path / "go2", tiny=True, start=kept, only_train=True)
+    gpu.main(again)
+    rows = (tmp_path / "go2" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(row)["step"] for row in rows] == [3, 4]
+
+
+@pytest.mark.slow(reason="compiles MJX three times and starts worker processes")
+def test_comparison_in_short(tmp_path):
+    for package in ("brax", "gymnasium", "rsl_rl", "torch"):
+        pytest.importorskip(package, reason="an extra, needed by this benchmark only")
+    path = tmp_path / "numbers.json"
+    command = [sys.executable, "-m", "benchmarks.comparison", "--short", "--json", str(path)]
+    subprocess.run(command, check=True)
+    tables = json.loads(path.read_text())["tables"]
+    assert set(tables["mjx"]) == {"kslc_jax", "purejaxrl", "brax"}
+    assert set(tables["mujoco"]) == {"kslc_jax", "purejaxrl", "torch"}
+    rates = [row["steps_per_second"] for table in tables.values() for row in table.values()]
+    assert min(rates) > 1

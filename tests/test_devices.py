@@ -1,0 +1,245 @@
+"""One training over several devices and processes: the numbers of one device.
+
+XLA reads how many devices to make of a CPU when it starts, so most of this runs in child processes:
+this file, run as a script, calls the function that is named on its command line.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import math
+import os
+import re
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import checkpoint, devices, observations, physics, train_step
+from kslc_jax.config import NUM_JOINTS, ConfigError, preset
+
+STEPS = 3
+MJX = dataclasses.replace(preset("debug"), physics=physics.PhysicsConfig(engine="mjx"))
+
+
+# -------------------------------------------------------------------------------- in the children
+
+
+def glide(config, state, target, dynamics, ground_friction):
+    """Physics that compiles at once: the joints go to their targets, nothing else moves."""
+    qpos = state.qpos.at[7:].set(0.9 * state.qpos[7:] + 0.1 * target)
+    return state.replace(qpos=qpos, torque=target)
+
+
+def numbers(tree) -> dict[str, np.ndarray]:
+    return {
+        jax.tree_util.keystr(path): checkpoint.host_array(x)
+        for path, x in jax.tree.leaves_with_path(tree)
+    }
+
+
+def learn(folder, engine):
+    """Trains on 1 and on 4 devices, and takes each other's last but one checkpoint to its end."""
+    folder = Path(folder)
+    if engine == "glide":
+        physics.step = glide
+    meshes = {count: devices.mesh(MJX, jax.devices()[:count]) for count in (1, 4)}
+    steps = {}
+    for count, mesh in meshes.items():
+        init, step = devices.make(MJX, mesh)
+        state = init()
+        steps[count] = step.lower(state).compile()
+        (folder / f"{count}.txt").write_text(steps[count].as_text())
+        for _ in range(STEPS - 1):
+            state, _ = steps[count](state)
+        with contextlib.closing(checkpoint.Store(folder / str(count))) as store:
+            store.save(state, MJX, {checkpoint.BEST_METRIC: 0.0})
+        np.savez(folder / f"{count}-saved.npz", **numbers(state))
+        state, metrics = steps[count](state)
+        np.savez(folder / f"{count}.npz", **numbers((state.learner, metrics)))
+    for before, after in ((1, 4), (4, 1)):
+        with contextlib.closing(checkpoint.Store(folder / str(before))) as store:
+            state = store.restore(jax.eval_shape(init), print)
+        state, metrics = steps[after](devices.place(meshes[after], state))
+        np.savez(folder / f"{before}-to-{after}.npz", **numbers((state.learner, metrics)))
+
+
+def learn_together(out, port, index, processes="2"):
+    """Trains with the devices of all processes."""
+    devices.join(f"127.0.0.1:{port}", int(processes), int(index))
+    assert jax.device_count() == int(processes) * jax.local_device_count()
+    init, step = devices.make(MJX, devices.mesh(MJX))
+    state, metrics = run(step, init(), STEPS)
+    np.savez(out, **numbers((state.learner, metrics)))
+
+
+def run(step, state, steps):
+    metrics = {}
+    for _ in range(steps):
+        state, metrics = step(state)
+    return state, metrics
+
+
+# ------------------------------------------------------------------------------------- the parent
+
+
+def command(name, *args, forced):
+    """What starts a child that sees `forced` devices: arguments for subprocess."""
+    flags = f"--xla_force_host_platform_device_count={forced}"
+    return {
+        "args": [sys.executable, __file__, name, *map(str, args)],
+        "env": {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags},
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
+
+
+def learnt(folder, engine):
+    done = subprocess.run(**command("learn", folder, engine, forced=4), timeout=500, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def glided(tmp_path_factory):
+    """What `learn` left, with cheap physics."""
+    return learnt(tmp_path_factory.mktemp("glide"), "glide")
+
+
+@pytest.fixture(scope="module")
+def stepped(tmp_path_factory):
+    """What `learn` left, with MJX."""
+    return learnt(tmp_path_factory.mktemp("mjx"), "mjx")
+
+
+def assert_close(a: Path, b: Path, tolerance=1e-5):
+    with np.load(a) as one, np.load(b) as other:
+        assert set(one) == set(other) and len(one) > 50
+        for name in one:
+            np.testing.assert_allclose(
+                one[name], other[name], rtol=tolerance, atol=tolerance, err_msg=name
+            )
+
+
+def test_four_devices_learn_what_one_learns(glided):
+    assert_close(glided / "1.npz", glided / "4.npz")
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
+def test_checkpoints_move_between_device_counts(before, after, glided):
+    assert_close(glided / f"{before}-to-{after}.npz", glided / f"{before}.npz")
+
+
+def test_one_device_reads_the_checkpoint_of_four(glided):
+    """In a process that never had four."""
+    with contextlib.closing(checkpoint.Store(glided / "4")) as store:
+        state = store.restore(like(), print)
+    with np.load(glided / "4-saved.npz") as saved:
+        for name, x in numbers(state).items():
+            np.testing.assert_array_equal(x, saved[name], err_msg=name)
+
+
+def test_devices_tell_what_the_documentation_counts(glided):
+    """Per train step, by the text of the program: each frame is sent once, and gradients are summed
+    at one place, in the loop over minibatches."""
+    assert not collectives(glided / "1.txt")
+    told = collectives(glided / "4.txt")
+    n, t = MJX.env.num_envs, MJX.ppo.rollout_steps
+    actor, critic = t + MJX.env.frames - 1, t + MJX.env.privileged_frames - 1
+    floats = {
+        "frames": n * (actor * observations.ACTOR_WIDTH + critic * observations.CRITIC_WIDTH),
+        "action and mean": 2 * n * t * NUM_JOINTS,
+        "log_prob, value, advantage, target, age, valid": 6 * n * t,
+    }
+    assert set(told) == {"all-gather", "all-reduce"}
+    assert sum(told["all-gather"]) == sum(floats.values())
+    params = sum(x.size for x in jax.tree.leaves(like().learner.params))
+    # A few numbers are summed in parts, and some scalars with them.
+    assert [abs(size - params) < 50 for size in told["all-reduce"]].count(True) == 1
+    assert sum(told["all-reduce"]) < params + 100
+
+
+def like():
+    """Shapes of a state."""
+    return jax.eval_shape(train_step.make(MJX)[0])
+
+
+def collectives(program: Path) -> dict[str, list[int]]:
+    """How many numbers each collective of a compiled program gives, by kind."""
+    found: dict[str, list[int]] = {}
+    kinds = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
+    for shapes, kind in re.findall(rf" = (.*) ({kinds})\(", program.read_text()):
+        sizes = [
+            math.prod(map(int, s.split(",") if s else []))
+            for s in re.findall(r"\[([\d,]*)\]", shapes)
+        ]
+        found.setdefault(kind, []).append(sum(sizes))
+    return found
+
+
+@pytest.mark.slow(reason="compiles MJX twice, a minute and a half on two cores")
+def test_four_devices_learn_what_one_learns_with_mjx(stepped):
+    assert_close(stepped / "1.npz", stepped / "4.npz")
+
+
+@pytest.mark.slow(reason="compiles MJX four times, three minutes on two cores")
+def test_two_processes_learn_what_one_learns(stepped, tmp_path):
+    """Two processes on this machine, of two devices each."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    files = [tmp_path / f"{index}.npz" for index in range(2)]
+    with contextlib.ExitStack() as both:
+        processes = []
+        for index, file in enumerate(files):
+            how = command("learn_together", file, port, index, forced=2)
+            processes.append(both.enter_context(subprocess.Popen(**how)))
+            both.callback(processes[-1].kill)
+        for process in processes:
+            _, errors = process.communicate(timeout=500)
+            assert process.returncode == 0, errors
+    assert_close(files[0], files[1], tolerance=0.0)
+    assert_close(files[0], stepped / "1.npz")
+
+
+def test_one_device_is_a_mesh_too(debug):
+    """A mesh of one device changes no bit, and takes the mujoco engine."""
+    finals = []
+    for init, step in (train_step.make(debug), devices.make(debug, devices.mesh(debug))):
+        state, metrics = run(step, init(), 2)
+        assert step._cache_size() == 1
+        finals.append(numbers((state, metrics)))
+    for name, expected in finals[0].items():
+        np.testing.assert_array_equal(finals[1][name], expected, err_msg=name)
+
+
+def test_what_cannot_be_split_is_refused(debug):
+    with pytest.raises(ConfigError, match=r"env\.num_envs: 16 .* over 3 devices"):
+        devices.mesh(debug, jax.devices() * 3)
+    with pytest.raises(ConfigError, match=r"physics\.engine: mujoco runs on one device"):
+        devices.mesh(debug, jax.devices() * 4)
+
+
+def test_seeds_train_side_by_side(debug):
+    """vmap over seeds gives each seed the training it has alone."""
+    seeds = jnp.array([0, 1])
+    init = jax.jit(functools.partial(train_step.init, debug))
+    step = jax.jit(jax.vmap(functools.partial(train_step.step, debug)))
+    together, _ = run(step, jax.jit(jax.vmap(init))(seeds), 2)
+    _, step = train_step.make(debug)
+    for i, seed in enumerate(seeds):
+        alone, _ = run(step, init(seed), 2)
+        mine = jax.tree.map(lambda x, i=i: x[i], together.learner.params)
+        for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(alone.learner.params), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-5)
+    kernels = together.learner.params["actor"]["Dense_0"]["kernel"]
+    assert float(jnp.abs(kernels[0] - kernels[1]).max()) > 0.01
+
+
+if __name__ == "__main__":
+    globals()[sys.argv[1]](*sys.argv[2:])

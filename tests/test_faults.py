@@ -1,0 +1,627 @@
+"""What a training survives: bad numbers, a full disk, damaged files, a second one in its folder."""
+
+import ast
+import contextlib
+import json
+import os
+import pickle
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from kslc_jax import checkpoint, doctor, physics, recovery, runner, runtime, train, train_step
+from kslc_jax.checkpoint import CheckpointError, Store
+from kslc_jax.config import preset, to_dict
+from kslc_jax.logs import MetricsFile
+
+ROOT = Path(__file__).parents[1]
+DEBUG = preset("debug")
+METRICS = dict.fromkeys(
+    [
+        *("score", "finite", "ppo/skipped", "tracking", "fast_tracking", "episode_steps"),
+        *("curriculum/v_max", "curriculum/cycle_time", "curriculum/tracking"),
+    ],
+    0.5,
+)
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Debug preset: initial state maker and compiled train step."""
+    init, step = train_step.make(DEBUG)
+    return init, step.lower(init()).compile()
+
+
+@pytest.fixture(scope="module")
+def like():
+    """Shapes of the debug preset's state."""
+    return jax.eval_shape(lambda: train_step.init(DEBUG, 0))
+
+
+@pytest.fixture(scope="module")
+def state_at(like):
+    """A state at a train step, full of numbers that mean nothing: what files are filled with."""
+
+    def leaf(x):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            return jax.random.key(0)
+        return jnp.asarray(np.random.default_rng(0).normal(size=x.shape), x.dtype)
+
+    return lambda step: jax.tree.map(leaf, like).replace(step=jnp.asarray(step, jnp.int32))
+
+
+def numbers(tree):
+    return [checkpoint.host_array(x) for x in jax.tree.leaves(tree)]
+
+
+def same(a, b):
+    pairs = zip(numbers(a), numbers(b), strict=True)
+    return all(np.array_equal(x, y, equal_nan=x.dtype.kind == "f") for x, y in pairs)
+
+
+def put(tree, where, value, rows=slice(None)):
+    """`tree` with `value` in the rows of the field named by a dotted path."""
+    name, _, rest = where.partition(".")
+    old = tree[name] if isinstance(tree, dict) else getattr(tree, name)
+    new = put(old, rest, value, rows) if rest else old.at[rows].set(value)
+    return {**tree, name: new} if isinstance(tree, dict) else tree.replace(**{name: new})
+
+
+# ---------------------------------------------------------------------------------- bad numbers
+
+SEEN_AT_ONCE = [
+    *("physics.qpos", "physics.qvel", "physics.qacc_warmstart", "physics.sensordata"),
+    *("physics.torque", "dynamics.kp", "gait.phase", "command.velocity", "history"),
+    *("privileged_history", "last_action", "last_last_action", "last_base_velocity", "push"),
+]
+SEEN_LATER = {"last_last_action": 2, "physics.qvel": 1}  # samples lost to an overflow by 1e30
+
+
+class TestEnvironments:
+    """One sample is lost, nothing else: not the update, not the curriculum, not the neighbours."""
+
+    def assert_contained(self, made, where, value, rows, lost):
+        init, step = made
+        healthy, _ = step(init())
+        new, metrics = step(put(init(), f"env.{where}", value, rows))
+        assert all(np.isfinite(x).all() for x in numbers(new) if x.dtype.kind == "f")
+        assert all(np.isfinite(value) for value in metrics.values())
+        assert metrics["broken"] == lost / DEBUG.batch_size
+        assert metrics["ppo/skipped"] == 0 and metrics["finite"] == 1
+        others = np.delete(np.arange(DEBUG.env.num_envs), rows)
+        keep = lambda state: jax.tree.map(lambda x: x[others], state.env)  # noqa: E731
+        assert same(keep(new), keep(healthy))
+
+    @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
+    @pytest.mark.parametrize("where", SEEN_AT_ONCE)
+    def test_one(self, made, where, value):
+        self.assert_contained(made, where, value, slice(3, 4), lost=1)
+
+    @pytest.mark.parametrize("where", SEEN_AT_ONCE)
+    def test_all(self, made, where):
+        self.assert_contained(made, where, jnp.nan, slice(None), lost=DEBUG.env.num_envs)
+
+    @pytest.mark.parametrize(("where", "lost"), SEEN_LATER.items())
+    def test_overflow_in_mid_rollout(self, made, where, lost):
+        """Finite at the start, so that the step itself makes the bad number."""
+        self.assert_contained(made, where, 1e30, slice(3, 4), lost)
+
+
+class TestLearner:
+    """What masking cannot mend is counted, and said in `finite`."""
+
+    @pytest.mark.parametrize(
+        "where",
+        [
+            "learner.params.actor.Dense_0.kernel",
+            "learner.params.critic.Dense_1.kernel",
+            "learner.learning_rate",
+            "curriculum.tracking",
+            "curriculum.v_max",
+        ],
+    )
+    def test_not_finite(self, made, where):
+        init, step = made
+        _, metrics = step(put(init(), where, jnp.nan, ...))
+        assert metrics["finite"] == 0
+
+    def test_optimiser(self, made):
+        init, step = made
+        state = init()
+        bad = jax.tree.map(
+            lambda x: x * jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else x,
+            state.learner.opt_state,
+        )
+        _, metrics = step(state.replace(learner=state.learner.replace(opt_state=bad)))
+        assert metrics["finite"] == 0
+
+    def test_gradient(self, made):
+        """A critic so large that its loss overflows: every update is skipped, nothing changes."""
+        init, step = made
+        state = put(init(), "learner.params.critic.Dense_0.kernel", 1e30, ...)
+        before = jax.tree.map(jnp.copy, state.learner)
+        new, metrics = step(state)
+        assert metrics["ppo/skipped"] == 1 and metrics["finite"] == 1
+        assert same(new.learner, before)
+
+
+# ------------------------------------------------------------------------------------- going back
+
+
+@pytest.fixture
+def training(state_at, tmp_path, monkeypatch):
+    """Runs the command line with a train step that only counts, and with `poison(state)` before it.
+
+    Poisoned are, as the metrics then say: a parameter with NaN, or the gradient by an infinite
+    learning rate."""
+
+    def run(poison, *args):
+        class Step:
+            lower = compile = lambda self, *_: self
+
+            def __call__(self, state):
+                state = poison(state)
+                finite = train_step.finite(state.learner.params)
+                skipped = jnp.isinf(state.learner.learning_rate)
+                metrics = METRICS | {"finite": finite, "ppo/skipped": skipped}
+                return state.replace(step=state.step + 1), metrics
+
+        monkeypatch.setattr(train_step, "make", lambda config: (lambda: state_at(0), Step()))
+        often = ["--run.checkpoint-minutes", "1e-9", *map(str, args)]
+        return train.main(["--preset", "debug", "--run-dir", str(run.dir), *often])
+
+    run.dir = tmp_path / "r"
+    return run
+
+
+def nan_actor(state):
+    return put(state, "learner.params.actor.Dense_0.kernel", jnp.nan, ...)
+
+
+def steps_of(run_dir):
+    return [json.loads(x)["step"] for x in (run_dir / "metrics.jsonl").read_text().splitlines()]
+
+
+class TestGoingBack:
+    def test_once_bad_goes_back_and_finishes(self, training, capsys):
+        seen = []
+
+        def poison(state):
+            seen.append(int(state.step))
+            return nan_actor(state) if seen[-1] == 5 and seen.count(5) == 1 else state
+
+        assert training(poison) == 0
+        out = capsys.readouterr().out
+        assert "warning: the learner or the curriculum is not finite; back to train step 5" in out
+        assert "attempt 1 of 3" in out and "done: 8 train steps, saved" in out
+        assert steps_of(training.dir) == list(range(1, 9))
+        policy = checkpoint.load_policy(training.dir)
+        assert policy.step == 8
+
+    def test_always_bad_stops_with_one_line_and_a_dump(self, training, capsys, state_at):
+        def poison(state):
+            return nan_actor(state) if int(state.step) == 5 else state
+
+        assert training(poison) == 1
+        said = capsys.readouterr()
+        assert [f"attempt {i} of 3" in said.out for i in (1, 2, 3, 4)] == [True] * 3 + [False]
+        (line,) = said.err.splitlines()
+        assert line.startswith("error: the learner") and "doctor replay" in line
+        assert Store(training.dir).steps()[-1] == 5, "a bad state was saved"
+        config, state = recovery.read_dump(training.dir / recovery.DUMP)
+        assert config == DEBUG and same(state.learner.params, state_at(5).learner.params)
+
+    def test_no_finite_gradient_for_long(self, training, capsys, monkeypatch):
+        monkeypatch.setattr(recovery, "PATIENCE", 3)
+
+        def poison(state):
+            rate = state.learner.learning_rate if int(state.step) < 3 else jnp.inf
+            return put(state, "learner.learning_rate", rate, ...)
+
+        assert training(poison) == 1
+        said = capsys.readouterr()
+        assert "not one finite gradient in 3 train steps; back to train step 3" in said.out
+        assert int(recovery.read_dump(training.dir / recovery.DUMP)[1].step) == 3
+
+    def test_bad_before_the_first_checkpoint_starts_anew(self, training, capsys):
+        once = [True]
+
+        def poison(state):
+            return nan_actor(state) if once and once.pop() else state
+
+        assert training(poison) == 0
+        assert "back to train step 0" in capsys.readouterr().out
+
+    def test_cautious(self, state_at):
+        state = state_at(3)
+        new = recovery.cautious(state, 2)
+        assert new.learner.learning_rate == pytest.approx(0.25 * state.learner.learning_rate)
+        assert new.key != state.key and same(new.learner.params, state.learner.params)
+
+    def test_replay_shows_where(self, made, tmp_path, capsys, monkeypatch):
+        """A number that overflows in the first control step, in one environment."""
+        monkeypatch.setattr(train_step, "make", lambda config: made)
+        path = tmp_path / "dump.npz"
+        state = put(made[0](), "env.last_last_action", 1e30, slice(3, 4))
+        recovery.dump(path, DEBUG, state)
+        assert same(recovery.read_dump(path)[1], state)
+        assert doctor.main(["replay", str(path)]) == 0
+        out = capsys.readouterr().out.splitlines()
+        assert out[0] == "train step 1 is the first with a number that is not finite:"
+        where = "  control step 1 of 8: rollout.outcome.terms.action_smoothness, environments 3"
+        assert where in out and not any("after" in line for line in out)
+
+    def test_no_dump(self, tmp_path, capsys):
+        (tmp_path / "x.npz").write_bytes(pickle.dumps("no dump"))
+        assert doctor.main(["replay", str(tmp_path / "x.npz")]) == 2
+        assert "is no dump" in capsys.readouterr().err
+
+
+# ------------------------------------------------------------------------------------- full disks
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A folder on a disk of 1 MB of its own."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)], capture_output=True
+    )
+    if done.returncode:
+        pytest.skip("mounting is not allowed here")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@contextlib.contextmanager
+def longest_file(size):
+    """No file may grow beyond `size` bytes: what a full disk is to one who may not mount."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+@pytest.fixture
+def saved(state_at):
+    """Fills a run folder with checkpoints."""
+
+    def save(run_dir, *steps):
+        with contextlib.closing(Store(run_dir)) as store:
+            for step in steps:
+                store.save(state_at(step), DEBUG, METRICS | {"step": step})
+        return run_dir
+
+    return save
+
+
+@pytest.fixture
+def restored(like):
+    """(train step, warnings) of what a resume of a run folder would go on from."""
+
+    def restore(run_dir):
+        said = []
+        with contextlib.closing(Store(run_dir)) as store:
+            state = store.restore(like, said.append)
+        return int(state.step), said
+
+    return restore
+
+
+class TestFullDisk:
+    def test_save_fails_in_one_line_and_leaves_nothing(self, saved, restored, state_at, disk):
+        saved(disk, 1)
+        (disk / "filler").write_bytes(bytes(shutil.disk_usage(disk).free - 60_000))
+        with contextlib.closing(Store(disk)) as store:
+            with pytest.raises(CheckpointError, match="no space left on the disk; those before"):
+                store.save(state_at(2), DEBUG, METRICS)
+                store.wait()
+            assert [p.name for p in store.folder.iterdir()] == ["1"]
+            (disk / "filler").unlink()
+            store.save(state_at(3), DEBUG, METRICS)
+        assert restored(disk) == (3, [])
+
+    def test_too_long_a_file(self, saved, restored, state_at, tmp_path):
+        """The same without rights to mount: nothing of the failure is left for the next save."""
+        saved(tmp_path, 1)
+        with contextlib.closing(Store(tmp_path)) as store:
+            with longest_file(2000), pytest.raises(CheckpointError, match="could not save"):
+                store.save(state_at(2), DEBUG, METRICS)
+                store.wait()
+            store.save(state_at(3), DEBUG, METRICS)
+        assert restored(tmp_path) == (3, [])
+
+    def test_training_goes_on_and_says_so(self, training, disk, capsys):
+        """The disk fills after the third train step and has room again after the sixth."""
+        filler = disk / "filler"
+        shutil.rmtree(training.dir, ignore_errors=True)
+        training.dir.symlink_to(disk)
+
+        def poison(state):
+            if int(state.step) == 3:
+                with filler.open("wb") as file, contextlib.suppress(OSError):
+                    file.write(bytes(2**20))
+            if int(state.step) == 6:
+                filler.unlink()
+            return state
+
+        assert training(poison, "--run.keep", 1) == 0
+        out = capsys.readouterr().out
+        assert "warning: could not save a checkpoint" in out and "training goes on" in out
+        assert steps_of(disk) == list(range(1, 9))
+        assert Store(disk).steps()[-1] == 8
+
+    def test_metrics_are_completed_when_there_is_room_again(self, tmp_path):
+        said, record = [], {"step": 1, "env_steps": 1, "x": 0.5}
+        file = MetricsFile(tmp_path, warn=said.append)
+        file.write(record)
+        size = file.path.stat().st_size
+        with longest_file(size + 10):
+            for step in (2, 3):
+                file.write(record | {"step": step})
+            assert file.path.stat().st_size == size + 10
+        file.write(record | {"step": 4})
+        file.close()
+        assert steps_of(tmp_path) == [1, 2, 3, 4] and len(said) == 1
+
+    def test_old_metrics_survive_a_resume_without_room(self, tmp_path):
+        lines = "".join(json.dumps({"step": i, "env_steps": i}) + "\n" for i in range(200))
+        (tmp_path / "metrics.jsonl").write_text(lines)
+        with longest_file(1000), pytest.raises(OSError):
+            MetricsFile(tmp_path, after=150)
+        assert (tmp_path / "metrics.jsonl").read_text() == lines
+        assert [p.name for p in tmp_path.iterdir()] == ["metrics.jsonl"]
+
+    def test_read_only(self, disk, capsys):
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        for folder in (disk, disk / "new"):
+            assert train.main(["--preset", "debug", "--run-dir", str(folder)]) == 2
+            (line,) = capsys.readouterr().err.splitlines()
+            assert line.startswith(f"error: cannot write to {folder}: Read-only")
+
+
+# ---------------------------------------------------------------------------------- damaged files
+
+
+def flip_a_bit(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 4
+    path.write_bytes(data)
+
+
+class TestDamage:
+    @pytest.mark.parametrize("item", ["params", "core", "env"])
+    def test_flipped_bit(self, saved, restored, tmp_path, item):
+        """In the numbers, where orbax itself sees nothing."""
+        saved(tmp_path, 1, 2)
+        files = (tmp_path / "checkpoints" / "2" / item / "ocdbt.process_0" / "d").iterdir()
+        flip_a_bit(max(files, key=lambda p: p.stat().st_size))
+        step, (warning,) = restored(tmp_path)
+        assert step == 1 and "checkpoint 2 is damaged" in warning and "1 is used" in warning
+        assert {p.name for p in (tmp_path / "checkpoints").iterdir()} == {"1", "damaged-2"}
+        saved(tmp_path, 2)  # what was damaged is not in the way
+        assert restored(tmp_path) == (2, [])
+
+    @pytest.mark.parametrize("item", ["params", "core", "env", "meta"])
+    def test_missing(self, saved, restored, tmp_path, item):
+        saved(tmp_path, 1, 2)
+        shutil.rmtree(tmp_path / "checkpoints" / "2" / item)
+        step, (warning,) = restored(tmp_path)
+        assert step == 1 and "damaged" in warning
+
+    def test_policy_with_a_flipped_bit(self, saved, restored, tmp_path):
+        saved(tmp_path, 1)
+        files = (tmp_path / "checkpoints" / "1" / "params" / "ocdbt.process_0" / "d").iterdir()
+        flip_a_bit(max(files, key=lambda p: p.stat().st_size))
+        with pytest.raises(CheckpointError, match="the numbers of 'params' are not those"):
+            checkpoint.load_policy(tmp_path)
+
+    def test_changed_meta(self, saved, restored, tmp_path):
+        edit_meta(saved(tmp_path, 1), lambda meta: meta["config"].update(seed=7))
+        with pytest.raises(CheckpointError, match="the numbers of 'meta' are not those"):
+            checkpoint.load_policy(tmp_path)
+
+
+def edit_meta(run_dir, change):
+    (path,) = (run_dir / "checkpoints").glob("*/meta/metadata")
+    meta = json.loads(path.read_text())
+    change(meta)
+    path.write_text(json.dumps(meta))
+
+
+class TestSchema:
+    def test_older_without_checksums_loads(self, saved, restored, tmp_path):
+        def strip(meta):
+            del meta["checksums"], meta["schema"]
+
+        edit_meta(saved(tmp_path, 1), strip)
+        assert restored(tmp_path) == (1, [])
+        assert checkpoint.load_policy(tmp_path).step == 1
+
+    def test_newer_says_why_not(self, saved, restored, tmp_path):
+        edit_meta(saved(tmp_path, 1), lambda meta: meta.update(schema=2))
+        for load in (checkpoint.load_policy, restored):
+            with pytest.raises(CheckpointError, match="checkpoint schema 2, this kslc_jax reads 1"):
+                load(tmp_path)
+
+    def test_newer_config_says_why_not(self, saved, restored, tmp_path):
+        def newer(meta):
+            meta["config"]["schema"] = 99
+            del meta["checksums"]
+
+        edit_meta(saved(tmp_path, 1), newer)
+        with pytest.raises(CheckpointError, match="schema version 99"):
+            checkpoint.load_policy(tmp_path)
+
+
+class Bomb:
+    """Writes a file when unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+class TestNoPickle:
+    FORBIDDEN = frozenset(
+        {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve"}
+    )
+
+    @pytest.mark.parametrize(
+        "path", sorted((ROOT / "kslc_jax").rglob("*.py")), ids=lambda p: p.stem
+    )
+    def test_nothing_unpickles(self, path):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not {name.split(".")[0] for name in names} & self.FORBIDDEN
+            if isinstance(node, ast.Call):
+                assert ast.unparse(node.func) not in ("eval", "exec", "jnp.load")
+                allowed = {k.arg: ast.unparse(k.value) for k in node.keywords}
+                assert allowed.get("allow_pickle", "False") == "False"
+
+    def test_a_pickle_in_place_of_any_file_does_nothing(self, saved, restored, tmp_path):
+        source = saved(tmp_path / "source", 1)
+        mark = tmp_path / "mark"
+        files = [p.relative_to(source) for p in source.rglob("*") if p.is_file()]
+        assert len(files) > 15
+        for file in files:
+            copy = tmp_path / "copy"
+            shutil.copytree(source, copy)
+            (copy / file).write_bytes(pickle.dumps(Bomb(mark)))
+            with contextlib.suppress(CheckpointError):
+                checkpoint.load_policy(copy)
+            with contextlib.suppress(CheckpointError):
+                restored(copy)
+            shutil.rmtree(copy)
+        dump = tmp_path / "bomb.npz"
+        np.savez(dump, config=np.array([Bomb(mark)], dtype=object))
+        with pytest.raises(CheckpointError):
+            recovery.read_dump(dump)
+        assert not mark.exists()
+
+
+# --------------------------------------------------------------------------------- locks and hangs
+
+
+class TestLock:
+    def test_names_the_process(self, tmp_path, capsys):
+        with runner.locked(tmp_path):
+            assert train.main(["--preset", "debug", "--run-dir", str(tmp_path)]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line == f"error: {tmp_path} is in use by another process, id {os.getpid()}"
+        assert [p.name for p in tmp_path.iterdir()] == [".lock"]
+
+    def test_death_releases(self, tmp_path):
+        code = (
+            "import time; from pathlib import Path; from kslc_jax import runner\n"
+            f"with runner.locked(Path({str(tmp_path)!r})):\n"
+            "    print('locked', flush=True); time.sleep(99)"
+        )
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+        assert process.stdout.readline() == "locked\n"
+        with pytest.raises(runner.RunError, match=f"id {process.pid}"), runner.locked(tmp_path):
+            pass
+        process.kill()
+        process.wait()
+        with runner.locked(tmp_path):
+            assert (tmp_path / ".lock").read_text() == str(os.getpid())
+
+
+class TestNoHang:
+    @pytest.mark.parametrize("args", [["--preset", "debug"], [], ["--resume"]])
+    def test_bad_jax_is_refused_on_every_path(self, args, tmp_path, monkeypatch, capsys):
+        if args == ["--resume"]:
+            (tmp_path / "config.json").write_text(json.dumps(to_dict(preset("debug"))))
+        monkeypatch.setattr(jax, "__version__", "0.10.2")
+        assert train.main([*args, "--run-dir", str(tmp_path)]) == 2
+        assert "jax 0.10.2 can hang" in capsys.readouterr().err
+
+    def test_watchdog_shows_where(self, capfd):
+        dog = runtime.Watchdog(factor=2.0, least=0.2, first=0.2)
+        with dog.step():
+            time.sleep(0.01)
+        assert capfd.readouterr().err == ""
+        with dog.step():
+            time.sleep(0.5)
+        err = capfd.readouterr().err
+        assert err.startswith("Timeout") and "test_watchdog_shows_where" in err
+
+    def test_watchdogs_limit(self):
+        dog = runtime.Watchdog()
+        assert dog.limit() == 600.0
+        dog._seconds.extend([1.0, 1.0, 100.0])
+        assert dog.limit() == 60.0
+        dog._seconds.extend([10.0] * 9)
+        assert dog.limit() == 200.0
+
+
+# ------------------------------------------------------------------------------------ determinism
+
+
+def five_steps(init, step):
+    state, rows = init(), []
+    for _ in range(5):
+        state, metrics = step(state)
+        rows.append({name: float(value).hex() for name, value in metrics.items()})
+    return rows
+
+
+class TestDeterminism:
+    def test_two_inits_and_any_number_of_threads(self, made, monkeypatch):
+        """Bit-identical metrics; the step is compiled once, the simulator's threads are changed
+        under it."""
+        init, step = made
+        rows, real = [five_steps(init, step)], physics._batch
+        for threads in (1, 2):
+            monkeypatch.setattr(
+                physics,
+                "_batch",
+                lambda robot, size, _, fields, n=threads: real(robot, size, n, fields),
+            )
+            rows.append(five_steps(init, step))
+            assert any(key[2] == threads for key in physics._batches)
+        assert rows[0] == rows[1] == rows[2]
+
+    @pytest.mark.slow(reason="compiles a train step with each engine, twice")
+    @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
+    def test_two_processes(self, engine, tmp_path):
+        """Two processes with one seed; with the mujoco engine on one thread and on two."""
+        rows = []
+        for i in (1, 2):
+            args = ["--preset", "debug", "--steps", 5 * 128, "--run-dir", tmp_path / str(i)]
+            args += ["--physics.engine", engine, "--physics.threads", i]
+            command = [sys.executable, "-m", "kslc_jax.train", *map(str, args)]
+            subprocess.run(command, check=True, capture_output=True)
+            text = (tmp_path / str(i) / "metrics.jsonl").read_text()
+            rows.append([json.loads(line) for line in text.splitlines()])
+        wall_clock = ("seconds", "steps_per_second")
+        a, b = ([{k: v for k, v in r.items() if k not in wall_clock} for r in x] for x in rows)
+        assert len(a) == 5 and a == b
+
+
+# ------------------------------------------------------------------------------------------ kills
+
+
+@pytest.mark.slow(reason="starts five trainings, each of which compiles")
+def test_kills(tmp_path):
+    """The kill harness in small: two SIGKILLs, one SIGTERM, then bit-identical metrics."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "kill_test.py"), "--kills", "2"]
+    command += ["--terms", "1", "--folder", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=550)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 of" in done.stdout and signal.SIGKILL.name in done.stdout

@@ -1,0 +1,109 @@
+"""The notebooks: tidy as they are stored, and running from top to bottom in their short mode."""
+
+import math
+import re
+import shutil
+from pathlib import Path
+
+import nbclient
+import nbformat
+import pytest
+
+from kslc_jax import plots
+
+ROOT = Path(__file__).parents[1]
+NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum")
+
+MOST_BYTES = 1_000_000
+MOST_LINES = 16
+"""Of a cell: a notebook calls the package, it has no logic of its own."""
+
+
+def read(name: str) -> nbformat.NotebookNode:
+    return nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
+
+
+def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
+    return [out for cell in notebook.cells for out in cell.get("outputs", ())]
+
+
+def text(notebook: nbformat.NotebookNode) -> str:
+    """All that the cells have written."""
+    parts = [
+        out.get("text") or out.get("data", {}).get("text/plain", "") for out in outputs(notebook)
+    ]
+    return "\n".join(parts)
+
+
+def pictures(notebook: nbformat.NotebookNode) -> int:
+    return sum("image/png" in out.get("data", {}) for out in outputs(notebook))
+
+
+@pytest.fixture
+def execute(tmp_path, monkeypatch):
+    """Runs a notebook in a copy of the folders that it reads, on the CPU and shortened."""
+    monkeypatch.setenv("KSLC_SHORT", "1")
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    (tmp_path / "notebooks").mkdir()
+    (tmp_path / "docs").symlink_to(ROOT / "docs")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+
+    def run(name: str) -> nbformat.NotebookNode:
+        where = {"metadata": {"path": str(tmp_path / "notebooks")}}
+        notebook = read(name)
+        return nbclient.NotebookClient(notebook, timeout=600, resources=where).execute()
+
+    return run
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_stored_as_run(name):
+    """Cells are short and were run in order without an error; pictures are in, files are small."""
+    notebook = read(name)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert max(len(cell.source.splitlines()) for cell in cells) <= MOST_LINES
+    assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))
+    assert not [out for out in outputs(notebook) if out.output_type == "error"]
+    assert pictures(notebook) >= 2
+    assert str(ROOT) not in nbformat.writes(notebook)
+    assert (ROOT / "notebooks" / f"{name}.ipynb").stat().st_size < MOST_BYTES
+
+
+@pytest.mark.slow(reason="a minute: renders a video and compiles a train step")
+def test_quickstart(execute):
+    """Three updates, counted and finite; strip and curve, or a word on why there is no strip."""
+    notebook = execute("01_quickstart")
+    rewards = [float(x) for x in re.findall(r"update .* reward (-?[\d.]+)", text(notebook))]
+    assert len(rewards) == 3 and all(map(math.isfinite, rewards))
+    drawn = "no pictures here" not in text(notebook)
+    assert pictures(notebook) == 1 + drawn
+    assert ("video/mp4" in nbformat.writes(notebook)) == drawn
+
+
+@pytest.mark.slow(reason="a minute: two trainings, and trials of a policy")
+def test_train_and_evaluate(execute, tmp_path):
+    """The second training goes on where the first stopped; the table has a row per speed."""
+    notebook = execute("02_train_and_evaluate")
+    assert "no GPU: on one" in text(notebook)
+    assert "resumed at train step 4" in text(notebook)
+    records = plots.read_metrics(tmp_path / "runs" / "notebook-debug")
+    assert list(records["step"]) == list(range(1, 9))
+    assert re.search(r"│\s+1\.0 │.*\n│\s+2\.0 │", text(notebook))
+    assert pictures(notebook) == 3
+
+
+def test_rewards_and_curriculum(execute):
+    """What the notebook prints is what the formulas give by hand."""
+    notebook = execute("03_rewards_and_curriculum")
+    printed, read = -math.exp(5.0), 1.0 - math.exp(1.0)
+    assert f"printed {printed:.1f}, as read {read:.3f}" in text(notebook)
+    for v in (0.5, 1.0, 2.0, 3.5):
+        value = math.exp(-5.0 * v**2)
+        line = f"commanded {v:.1f} m/s: reward {value:.1e}, slope {10.0 * v * value:.1e}"
+        assert line in text(notebook)
+    stored = plots.read_metrics(ROOT / "docs" / "training" / "laptop-seed0.jsonl")
+    assert len(re.findall("^v_max .* m/s from", text(notebook), re.M)) == len(
+        plots.milestones(stored)
+    )
+    assert pictures(notebook) == 9

@@ -1,0 +1,162 @@
+"""Drake against C MuJoCo: the same robot, the same motion, the same rest; contact of its own."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from kslc_jax import checkpoint, curriculum, networks, physics, randomize, trials
+from kslc_jax.config import HighFidelity, preset
+
+pytest.importorskip("pydrake", reason="Drake is an optional extra")
+
+from kslc_jax import drake
+
+CONFIG = HighFidelity()
+NOMINAL = jax.tree.map(np.asarray, randomize.nominal())
+
+
+@pytest.fixture(scope="module")
+def world():
+    robot = physics.robot_for(CONFIG)
+    return drake.build(robot, robot.mj_model)
+
+
+def random_state(seed):
+    rng = np.random.default_rng(seed)
+    qpos = np.r_[rng.normal(size=7), rng.uniform(-1, 1, 16)]
+    qpos[3:7] /= np.linalg.norm(qpos[3:7])
+    return qpos, rng.normal(size=22)
+
+
+def rest(qpos, qvel=None):
+    """A PhysicsState in float64."""
+    state = physics.initial_state(CONFIG, jnp.asarray(qpos), jnp.zeros(22))
+    state = jax.tree.map(lambda x: np.asarray(x, np.float64), state)
+    return state.replace(qpos=np.array(qpos), qvel=np.zeros(22) if qvel is None else qvel)
+
+
+def simulate(world, state, target=0.0, steps=1):
+    """States of `steps` control steps in Drake and in C MuJoCo."""
+    target = np.full(16, target)
+    ours, theirs = [state], [state]
+    for _ in range(steps):
+        ours.append(drake.advance(world, ours[-1], target, NOMINAL, CONFIG.decimation))
+        theirs.append(physics._host_step(CONFIG, theirs[-1], target, NOMINAL, {}))
+    return ours[1:], theirs[1:]
+
+
+def test_total_mass(world):
+    total = world.plant.CalcTotalMass(world.plant_context)
+    assert total == pytest.approx(world.robot.total_mass, rel=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_links_and_mass_matrix_agree_at_random_poses(world, seed):
+    """Positions to 1e-9 m, the 22 x 22 mass matrix in MuJoCo's coordinates to 1e-9 relative."""
+    model, data = world.data.model, mujoco.MjData(world.data.model)
+    data.qpos[:], data.qvel[:] = random_state(seed)
+    mujoco.mj_forward(model, data)
+    drake.set_state(world, data.qpos, data.qvel)
+    for name, back in zip(("qpos", "qvel"), drake.get_state(world), strict=True):
+        np.testing.assert_allclose(back, getattr(data, name), atol=1e-12)
+    for i in range(1, model.nbody):
+        link = world.plant.GetBodyByName(model.body(i).name)
+        position = world.plant.EvalBodyPoseInWorld(world.plant_context, link).translation()
+        np.testing.assert_allclose(position, data.xpos[i], atol=1e-9)
+    theirs = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, theirs)
+    # Drake's velocities are turned @ qvel: the base's rate is in the world there.
+    turned = np.eye(model.nv)
+    mujoco.mju_quat2Mat(flat := np.zeros(9), data.qpos[3:7])
+    turned[3:6, 3:6] = flat.reshape(3, 3)
+    ours = world.plant.CalcMassMatrix(world.plant_context)[np.ix_(world.v_index, world.v_index)]
+    np.testing.assert_allclose(turned.T @ ours @ turned, theirs, atol=1e-9 * theirs.max())
+
+
+def test_free_fall_is_exact(world):
+    """From rest both engines' semi-implicit Euler gives z = z0 - g dt^2 n (n + 1) / 2."""
+    qpos = world.robot.default_qpos.copy()
+    qpos[2] = 5.0
+    n, dt = 200, CONFIG.timestep
+    expected = 5.0 - 9.81 * dt**2 * n * (n + 1) / 2
+    for states in simulate(world, rest(qpos), steps=n // CONFIG.decimation):
+        assert states[-1].qpos[2] == pytest.approx(expected, abs=1e-5)  # float32 in C MuJoCo's
+        np.testing.assert_allclose(states[-1].qpos[7:], 0.0, atol=1e-5)
+
+
+def test_tumbling_with_driven_joints_agrees(world):
+    """0.2 s in the air, rotating, all joints driven to 0.3 rad: inertia, motors, friction."""
+    qpos = world.robot.default_qpos.copy()
+    qpos[2] = 5.0
+    qvel = np.r_[1.0, 0.5, 2.0, 1.0, -2.0, 1.5, np.zeros(16)]
+    ours, theirs = simulate(world, rest(qpos, qvel), target=0.3, steps=20)
+    np.testing.assert_allclose(ours[-1].qpos, theirs[-1].qpos, atol=5e-3)
+    np.testing.assert_allclose(ours[-1].sensordata, theirs[-1].sensordata, atol=0.1)
+
+
+def test_dropped_on_its_feet_it_rests_at_the_same_height(world):
+    """From 2 cm, servos holding: within 5 mm from 0.2 s on, and the feet carry the weight."""
+    qpos = world.robot.default_qpos.copy()
+    qpos[2] = 0.905
+    ours, theirs = simulate(world, rest(qpos), steps=60)
+    apart = [a.qpos[2] - b.qpos[2] for a, b in zip(ours, theirs, strict=True)]
+    assert np.abs(apart[20:]).max() < 0.005
+    touch = np.r_[[world.robot.sensor(f"{foot}_touch").start for foot in drake.FEET]]
+    load = np.mean([state.sensordata[touch].sum() for state in ours[30:]])
+    assert load == pytest.approx(9.81 * world.robot.total_mass, rel=0.05)
+
+
+def test_low_friction_slides(world):
+    """Set down at 0.3 m/s sideways the feet slide 2 cm in 0.2 s with friction 0.05 in both engines,
+    and hardly with 1.0."""
+    qpos = world.robot.default_qpos.copy()
+    qpos[2] = 0.885
+    state = rest(qpos, np.r_[0.0, 0.3, np.zeros(20)])
+    slid = {}
+    for mu in (0.05, 1.0):
+        fields = randomize.model_fields(world.robot, randomize.nominal(mu), mu)
+        fields = jax.tree.map(lambda x: np.asarray(x, np.float64), fields)
+        for engine, step in (("drake", drake._host_step), ("mujoco", physics._host_step)):
+            now = state
+            for _ in range(20):
+                now = step(CONFIG, now, np.zeros(16), NOMINAL, fields)
+            slid[engine, mu] = now.sensordata[world.robot.sensor("left_foot_pos")][1]
+    start = 0.117  # y of the left foot
+    assert slid["drake", 0.05] == pytest.approx(slid["mujoco", 0.05], abs=2e-3)
+    for engine in ("drake", "mujoco"):
+        assert slid[engine, 0.05] - start > 0.017
+        assert abs(slid[engine, 1.0] - start) < 0.005
+
+
+def test_step_is_physics_step(world):
+    """Under jit and vmap, with different payloads: shapes, types, and each as it is alone."""
+    step = jax.jit(
+        jax.vmap(lambda s, d: drake.step(CONFIG, s, jnp.zeros(16), d, 1.0), in_axes=(None, 0))
+    )
+    start = physics.initial_state(CONFIG, jnp.asarray(world.robot.default_qpos), jnp.zeros(22))
+    heavy = randomize.nominal().replace(base_mass=jnp.array(5.0))
+    both = step(start, jax.tree.map(lambda *x: jnp.stack(x), randomize.nominal(), heavy))
+    assert jax.tree.map(lambda x: x.shape[1:], both) == jax.tree.map(jnp.shape, start)
+    for i, dynamics in enumerate((randomize.nominal(), heavy)):
+        fields = randomize.model_fields(world.robot, dynamics, 1.0)
+        one = drake._host_step(CONFIG, start, np.zeros(16), dynamics, fields)
+        for a, b in zip(jax.tree.leaves(both), jax.tree.leaves(one), strict=True):
+            np.testing.assert_allclose(a[i], b, rtol=0, atol=1e-30)  # XLA drops denormals
+
+
+def test_a_diverged_step_shows_as_nan(world):
+    state = rest(world.robot.default_qpos, np.r_[np.nan, np.zeros(21)])
+    assert np.isnan(drake.advance(world, state, np.zeros(16), NOMINAL, 1).qpos).any()
+
+
+def test_servos_alone_stand_a_second_in_drake():
+    """The whole way of a policy: environment, signals, observations, trace."""
+    config = preset("debug")
+    params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
+    still = checkpoint.Policy(config, params, curriculum.init(config), 0)
+    setting = trials.Setting(CONFIG, seconds=1.0, simulate=drake.step)
+    trace = trials.join(list(trials.run(still, setting, np.zeros((1, 3)))))
+    assert trace.alive[:80].all() and trace.contact[30:80].mean() > 0.9
+    assert 0.8 < trace.qpos[50, 0, 2] < 0.9

@@ -1,0 +1,165 @@
+"""Sim-to-sim: perturbations, latency and sensor errors do what they are called."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from kslc_jax import (
+    checkpoint,
+    curriculum,
+    env,
+    evaluate,
+    networks,
+    randomize,
+    robot,
+    sim2sim,
+    trials,
+)
+from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
+
+
+@pytest.fixture(scope="module")
+def random_policy():
+    """An untrained policy with sizeable actions."""
+    config = preset("debug")
+    config = dataclasses.replace(config, network=dataclasses.replace(config.network, init_mean=1.0))
+    params = networks.init(config, jax.random.key(1))
+    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+
+
+@pytest.fixture
+def frozen(monkeypatch):
+    """An environment that only shows the action it was sent, as its torque, and ends."""
+
+    def step(config, state, action, key, curriculum):
+        shown = state.replace(physics=state.physics.replace(torque=action))
+        fell = jax.numpy.ones((), bool)
+        return shown, env.Outcome(**dict.fromkeys(env.Outcome.__dataclass_fields__, fell))
+
+    monkeypatch.setattr(env, "step", step)
+
+
+def actions(policy, **conditions):
+    """Actions sent [T, 16], and the history [K, 59] that the first one answered."""
+    setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=0.03, **conditions)
+    config = trials.trial_config(policy.config, setting, 1)
+    key = jax.random.split(jax.random.split(jax.random.key(0))[0], 1)[0]
+    history = jax.jit(lambda k: env.reset(config, k, policy.curriculum).history)(key)
+    trace = next(iter(trials.run(policy, setting, np.zeros((1, 3)), chunk=0.03)))
+    return trace.torque[:, 0], history
+
+
+def dynamics(condition):
+    """The dynamics and the contact friction under a condition."""
+    conditions = sim2sim.setting(sim2sim.Args("x"), condition).randomize
+    drawn = randomize.sample(conditions, jax.random.key(0))
+    fields = randomize.model_fields(robot.load("high"), drawn, conditions.ground_friction)
+    return drawn, fields["geom_friction"][robot.load("high").foot_geom_ids, 0]
+
+
+def test_the_nominal_robot_is_the_described_one_at_high_fidelity():
+    setting = sim2sim.setting(sim2sim.Args("x"), "nominal")
+    assert setting.physics == HighFidelity() and setting.randomize == trials.NOMINAL
+    assert setting.seconds == 60.0 and not setting.noise and not setting.latency
+    drawn, friction = dynamics("nominal")
+    np.testing.assert_allclose(friction, 1.0)
+    np.testing.assert_array_equal(drawn.kp, 1.0)
+
+
+@pytest.mark.parametrize("mu", [0.3, 1.5])
+def test_friction_is_that_of_the_contact(mu):
+    """Foot and ground are averaged; the named value is what comes out."""
+    np.testing.assert_allclose(dynamics(f"friction={mu}")[1], mu, rtol=1e-6)
+
+
+def test_perturbations_reach_the_robot():
+    assert dynamics("payload=-5")[0].base_mass == -5.0
+    gains = dynamics("gains=0.85")[0]
+    np.testing.assert_allclose(np.r_[gains.kp, gains.kd], 0.85, rtol=1e-6)
+    np.testing.assert_allclose(dynamics("strength=0.9")[0].motor_strength, 0.9, rtol=1e-6)
+    push = sim2sim.setting(sim2sim.Args("x"), "push=0.5").randomize
+    assert (push.push_seconds, push.push_velocity, push.push_angular) == (4.0, 0.5, 0.0)
+    assert sim2sim.setting(sim2sim.Args("x"), "imu=0.03").imu_offset == (0.03, 0.03)
+
+
+def test_all_runs_ten_perturbations_after_the_nominal_robot():
+    conditions = sim2sim.Args("x", perturb=("all",)).conditions
+    assert conditions[0] == "nominal" and len(set(conditions)) == 11
+
+
+@pytest.mark.parametrize("name", ["wind=3", "payload", "payload=heavy", "payload=-30", "all=1"])
+def test_perturbations_that_cannot_be_are_refused(name):
+    with pytest.raises(ConfigError):
+        sim2sim.Args("x", perturb=(name,))
+
+
+def test_latency_sends_the_action_before(random_policy, frozen):
+    """In the first step there is none, which asks for the default pose."""
+    sent, history = actions(random_policy, latency=True)
+    decided = random_policy.act_on(history)
+    assert np.abs(decided).max() > 0.01
+    np.testing.assert_allclose(sent, [0.0 * decided, decided, decided], atol=1e-6)
+
+
+def test_imu_offset_is_an_error_of_roll_and_pitch(random_policy, frozen):
+    """By hand: clock 2, command 3, joints 3 x 16, rates 3, so roll and pitch are 56 and 57."""
+    sent, history = actions(random_policy, imu_offset=(0.3, 0.2))
+    seen = history.at[:, 56].add(0.3).at[:, 57].add(0.2)
+    np.testing.assert_allclose(sent[0], random_policy.act_on(seen), atol=1e-6)
+    assert np.abs(sent[0] - random_policy.act_on(history)).max() > 1e-3
+
+
+def test_a_sweep_too_large_for_memory_goes_speed_by_speed(random_policy, frozen, monkeypatch):
+    monkeypatch.setattr(evaluate, "MOST_SAMPLES", 1)
+    shares = []
+    setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=3.0)
+    rows = evaluate.measure(random_policy, setting, (0.0, 1.0), 1, progress=shares.append)
+    assert [row["command"] for row in rows] == [0.0, 1.0]
+    np.testing.assert_allclose(shares, np.arange(1, 7) / 6)
+
+
+def test_report(random_policy, monkeypatch, tmp_path, capsys):
+    """One table per condition, a summary, and JSON that holds every row."""
+
+    def measure(policy, setting, speeds, seeds, seed, progress):
+        progress(1.0)
+        extra = setting.randomize.base_mass[0]
+        return [{"command": v, "survival": 0.5, "forward_mean": v - extra} for v in speeds]
+
+    monkeypatch.setattr(evaluate, "measure", measure)
+    monkeypatch.setattr(checkpoint, "load_policy", lambda path: random_policy)
+    out = tmp_path / "deep" / "out.json"
+    argv = ["p", "--speeds", "1", "2", "--perturb", "payload=0.25", "--latency", "--json", str(out)]
+    assert sim2sim.main(argv) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("payload=0.25") == 2 and "50% 1.75" in shown
+    kept = json.loads(out.read_text())
+    assert kept["latency"] and not kept["noise"] and kept["engine"] == "mujoco"
+    assert [r["forward_mean"] for r in kept["conditions"]["payload=0.25"]] == [0.75, 1.75]
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["no-such-policy"], "no run, checkpoint or shipped policy"),
+        (["x", "--seconds", "2"], "seconds must be at least 3"),
+        (["x", "--seeds", "0"], "seeds must be positive"),
+        (["x", "--perturb", "wind=3"], "cannot read 'wind=3'"),
+    ],
+)
+def test_errors_are_one_line(argv, says, capsys):
+    assert sim2sim.main(argv) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1 and err[0].startswith("error: ") and says in err[0]
+
+
+def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
+    def missing(args, condition):
+        raise ModuleNotFoundError("No module named 'pydrake'")
+
+    monkeypatch.setattr(sim2sim, "setting", missing)
+    assert sim2sim.main(["x", "--engine", "drake"]) == 2
+    assert "pip install 'kslc_jax[drake]'" in capsys.readouterr().err

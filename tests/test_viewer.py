@@ -1,0 +1,343 @@
+"""Playing a policy live: the session, the pacer, the viewer's figure and panel, and the page."""
+
+import dataclasses
+import io
+import shutil
+import socket
+import sys
+import threading
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import mujoco
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+
+import kslc_jax
+from kslc_jax import checkpoint, config, curriculum, networks, play, session, trials
+from kslc_jax.config import HighFidelity, PhysicsConfig, preset
+
+C_MUJOCO = PhysicsConfig(engine="mujoco")
+BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
+
+
+@pytest.fixture(scope="module")
+def still():
+    """A policy that asks for the default pose whatever it sees."""
+    params = jax.tree.map(np.zeros_like, networks.init(preset("debug"), jax.random.key(0)))
+    return checkpoint.Policy(preset("debug"), params, curriculum.init(preset("debug")), 0)
+
+
+@pytest.fixture(scope="module")
+def run_dir(still, tmp_path_factory):
+    """A run folder with the checkpoints 2 and 10 of that policy."""
+    root = tmp_path_factory.mktemp("run")
+    reached = {"curriculum/v_max": 1.5, "curriculum/cycle_time": 0.6}
+    meta = {"schema": 1, "config": config.to_dict(still.config), "metrics": reached}
+    for step in ("2", "10"):
+        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
+            items = ocp.args.Composite(
+                params=ocp.args.StandardSave(still.params), meta=ocp.args.JsonSave(meta)
+            )
+            writer.save(root / checkpoint.FOLDER / step, args=items)
+    return root
+
+
+# ------------------------------------------------------------------------------------------ session
+
+
+@pytest.mark.parametrize("rate", [0.25, 1.0, 2.0])
+def test_pacer_keeps_the_rate(rate):
+    pacer = session.Pacer(dt=0.01)
+    steps = [pacer.due(i / 30, rate) for i in range(10 * 30 + 1)]
+    assert sum(steps) == pytest.approx(10.0 * rate / 0.01, abs=1)
+    assert max(steps) - min(steps[1:]) <= 1
+
+
+def test_pacer_forgets_what_it_cannot_make_up_for():
+    pacer = session.Pacer(dt=0.01, longest=0.1)
+    assert pacer.due(5.0, 1.0) == 0
+    assert pacer.due(65.0, 1.0) == 10
+    assert pacer.due(75.0, 0.0) == 0 and pacer.due(75.02, 1.0) == 2
+
+
+def test_a_session_is_a_trial(still):
+    """Same start, same command, same policy: the same motion as `trials.run`."""
+    quiet = dataclasses.replace(still.config.env, reset_joint_noise=0.0)
+    exact = dataclasses.replace(still, config=dataclasses.replace(still.config, env=quiet))
+    command = np.array([0.3, 0.1, 0.2])
+    trace = next(trials.run(exact, trials.Setting(C_MUJOCO), command[None]))
+    live = session.Session(exact, C_MUJOCO)
+    qpos = [live.advance(command).qpos for _ in range(80)]
+    np.testing.assert_allclose(qpos, trace.qpos[:80, 0], atol=2e-5)
+
+
+def test_heading_is_kept_where_turning_ended(still):
+    live = session.Session(still, HighFidelity())
+    for _ in range(30):
+        live.advance(np.array([0.0, 0.0, 0.5]))
+    yaw = 2 * np.arctan2(live.view.qpos[6], live.view.qpos[3])
+    live.advance(np.zeros(3))
+    assert float(live._memory.env.command.heading) == pytest.approx(yaw, abs=0.01)
+
+
+def test_a_push_changes_the_base_velocity(still):
+    push = np.array([0.5, -0.3])
+    left, pushed = (session.Session(still, C_MUJOCO) for _ in range(2))
+    for _ in range(20):
+        left.advance(np.zeros(3))
+        pushed.advance(np.zeros(3))
+    change = pushed.advance(np.zeros(3), push).velocity - left.advance(np.zeros(3)).velocity
+    np.testing.assert_allclose(change[:2], push, atol=0.15)
+
+
+def test_a_fallen_robot_lies_a_second_and_starts_anew(still):
+    live = session.Session(still, C_MUJOCO)
+    views = [live.advance(np.zeros(3)) for _ in range(500)]
+    fell = next(i for i, v in enumerate(views) if v.fallen)
+    lying = views[fell : fell + 101]
+    assert all(v is lying[0] for v in lying) and lying[0].qpos[2] < 0.75
+    after = views[fell + 101]
+    assert not after.fallen and after.qpos[2] > 0.85
+    assert not live.reset().fallen and live.view.qpos[2] == pytest.approx(0.95)
+
+
+# ------------------------------------------------------------------------------------------ picture
+
+
+def volume(model, geom) -> float:
+    """Of a primitive [m^3]."""
+    a, b, c = model.geom_size[geom]
+    kinds = mujoco.mjtGeom
+    return {
+        kinds.mjGEOM_SPHERE: 4 / 3 * np.pi * a**3,
+        kinds.mjGEOM_ELLIPSOID: 4 / 3 * np.pi * a * b * c,
+        kinds.mjGEOM_BOX: 8 * a * b * c,
+        kinds.mjGEOM_CYLINDER: 2 * np.pi * a**2 * b,
+        kinds.mjGEOM_CAPSULE: 2 * np.pi * a**2 * b + 4 / 3 * np.pi * a**3,
+    }[kinds(model.geom_type[geom])]
+
+
+def test_meshes_have_the_geoms_size_and_place(xbot):
+    viewer = pytest.importorskip("kslc_jax.viewer", reason="the extra 'viewer' is not installed")
+    model = xbot.mj_model
+    drawn = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
+    assert len(drawn) > 40
+    for geom in drawn:
+        mesh = viewer.mesh(model, geom)
+        assert mesh.volume == pytest.approx(volume(model, geom), rel=0.03), model.geom(geom).name
+        np.testing.assert_allclose(mesh.bounds.mean(0), model.geom_pos[geom], atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def viewer(run_dir):
+    """A viewer on a free port; nothing runs but what a test asks for."""
+    pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+    from kslc_jax.viewer import Viewer
+
+    made = Viewer(run_dir, "train", port=0)
+    yield made
+    made.server.stop()
+
+
+def test_figure_follows_or_stays(viewer, xbot):
+    qpos = xbot.default_qpos.copy()
+    qpos[:2] = 3.0, -2.0
+    data = mujoco.MjData(xbot.mj_model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(xbot.mj_model, data)
+    viewer.figure.show(viewer.session.view.replace(qpos=qpos))
+    for body, frame in viewer.figure._bodies.items():
+        np.testing.assert_allclose(frame.position, data.xpos[body], atol=1e-6)
+        np.testing.assert_allclose(frame.wxyz, data.xquat[body], atol=1e-6)
+    np.testing.assert_allclose(viewer.figure._world.position, [-3.0, 2.0, 0.0])
+    viewer.figure.follow, qpos[0] = False, 4.0
+    viewer.figure.show(viewer.session.view.replace(qpos=qpos))
+    np.testing.assert_allclose(viewer.figure._world.position, [-3.0, 2.0, 0.0])
+
+
+def test_panel(viewer):
+    panel = viewer.panel
+    vx = panel._sliders[0]
+    assert (vx.min, vx.max) == (-0.5, 2.0)
+    panel._change(np.array([1.9, 0.0, 0.2]))
+    panel._change(np.array([0.25, 0.0, 0.2]))
+    np.testing.assert_allclose(panel.command, [2.0, 0.0, 0.4])
+    panel.allow(1.0)
+    assert panel.command[0] == vx.max == 1.5
+    panel.allow(1.5)
+    panel._stop()
+    assert not panel.command.any()
+    rng = np.random.default_rng(0)
+    assert panel.take_push(rng) is None
+    panel._push_wanted.set()
+    assert np.hypot(*panel.take_push(rng)) == pytest.approx(panel._push.value)
+    assert panel.take_push(rng) is None
+
+
+def test_frames_step_only_while_watched(viewer, monkeypatch):
+    viewer.reset()
+    viewer.frame(0.0)
+    viewer.frame(0.05)
+    assert len(viewer._recent) == 0
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: None})
+    viewer.panel._change(np.array([0.5, 0.0, 0.0]))
+    viewer.frame(0.10)
+    viewer.frame(0.15)
+    assert len(viewer._recent) == 10 and viewer._recent[-1].command[0] == 0.5
+    assert "of 0.50 commanded, up" in viewer.panel.status.content
+    viewer.panel._pause()
+    viewer.frame(0.20)
+    assert len(viewer._recent) == 10
+    viewer.panel._pause()
+    viewer.panel._stop()
+
+
+def test_policies_of_a_run(run_dir):
+    pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+    from kslc_jax.viewer import policies
+
+    found = policies(run_dir)
+    assert list(found)[:2] == [str(run_dir), "step 2"]
+    assert found[str(run_dir)].name == "10" and found["step 2"].name == "2"
+
+
+def test_switching_policy(viewer):
+    viewer.panel.policy.value = "step 2"
+    viewer.frame(0.0)
+    assert viewer.session.policy.step == 2
+
+
+# --------------------------------------------------------------------------------------------- CLI
+
+
+def test_port_in_use_is_one_line(run_dir, capsys):
+    pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert play.main([str(run_dir), "--port", str(port)]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1 and f"{port}: the port is in use" in err[0]
+
+
+def test_viewer_not_installed_is_one_line(run_dir, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer", None)
+    assert play.main([str(run_dir)]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1 and "pip install 'kslc_jax[viewer]'" in err[0]
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["no-such-policy"], "no run, checkpoint or shipped policy"),
+        (["x", "--port", "70000"], "port must lie in"),
+        (["x", "--seconds", "0"], "seconds must be positive"),
+    ],
+)
+def test_errors_are_one_line(argv, says, capsys):
+    pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+    assert play.main(argv) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1 and err[0].startswith("error: ") and says in err[0]
+
+
+@pytest.mark.parametrize(
+    ("host", "local"),
+    [("127.0.0.1", True), ("::1", True), ("localhost", True), ("0.0.0.0", False), ("box", False)],
+)
+def test_which_addresses_are_local(host, local):
+    assert play.is_local(host) is local
+
+
+def test_caption_writes_into_the_corner():
+    black = np.zeros((480, 640, 3), np.uint8)
+    written = play.caption(black, "commanded 2.0 m/s\nactual 1.95 m/s")
+    assert written.shape == black.shape and written[:100, :320].max() == 255
+    assert not written[100:].any() and not written[:, 320:].any()
+
+
+def test_video_carries_the_speeds(monkeypatch, tmp_path):
+    """Two speeds of half a second each at 50 frames a second, with text, drawn without GL."""
+    imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
+    pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
+    blank = SimpleNamespace(frames=lambda qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos))
+    monkeypatch.setitem(sys.modules, "kslc_jax.render", blank)
+    monkeypatch.setattr(kslc_jax, "render", blank, raising=False)
+    said = []
+    write = play.caption
+    monkeypatch.setattr(play, "caption", lambda p, text: said.append(text) or write(p, text))
+    args = play.Args(Path("x"), speeds=(1.0, 2.0), seconds=0.5)
+    linvel = np.zeros((150, 2, 3))
+    linvel[..., 0] = 0.9, 2.1
+    trace = SimpleNamespace(qpos=np.zeros((150, 2, 23)), linvel=linvel)
+    play.write_video(tmp_path / "a" / "out.mp4", args, trace, start=100, dt=0.01)
+    frames = imageio.mimread(tmp_path / "a" / "out.mp4", memtest=False)
+    assert len(frames) == 50 and max(f.max() for f in frames) > 200
+    assert set(said) == {
+        "commanded 1.0 m/s\nactual 0.90 m/s",
+        "commanded 2.0 m/s\nactual 2.10 m/s",
+    }
+
+
+# -------------------------------------------------------------------------------------------- page
+
+
+@pytest.mark.slow(reason="a minute: a browser that draws in software")
+def test_the_page(run_dir):
+    """In a real browser: no error, the robot is in the picture, a slider commands it."""
+    pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
+    playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
+    browser_path = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser_path is None:
+        pytest.skip(f"none of {', '.join(BROWSERS)} is installed")
+    from kslc_jax.viewer import Viewer
+
+    made = Viewer(run_dir, "train", port=0)
+    stop = threading.Event()
+
+    def serve():
+        while not stop.wait(0.03):
+            made.frame(time.monotonic())
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    errors = []
+    try:
+        with playwright.sync_playwright() as p:
+            software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+            browser = p.chromium.launch(
+                executable_path=browser_path, args=["--no-sandbox", *software]
+            )
+            page = browser.new_page(viewport={"width": 900, "height": 700})
+            page.on("console", lambda m: errors.append(m.text) if m.type == "error" else None)
+            page.on("pageerror", lambda error: errors.append(str(error)))
+            page.goto(f"http://127.0.0.1:{made.server.get_port()}")
+            page.get_by_text("commanded, ").wait_for()
+            vx = page.locator("input:visible").first
+            vx.fill("0.75")
+            vx.press("Enter")
+            page.get_by_text("of 0.75 commanded").wait_for()
+            page.locator("canvas").first.click(position={"x": 20, "y": 650})
+            page.keyboard.press("i")
+            page.get_by_text("of 1.00 commanded").wait_for()
+            picture = page.screenshot(timeout=60_000, clip=dict(x=0, y=0, width=500, height=700))
+            browser.close()
+    finally:
+        stop.set()
+        thread.join()
+        made.server.stop()
+    assert errors == []
+    assert colours_of_the_robot(picture) > 0.005
+
+
+def colours_of_the_robot(png: bytes) -> float:
+    """Share of a picture's pixels that have the orange of the joints."""
+    from PIL import Image
+
+    rgb = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float)
+    orange = (rgb[..., 0] - rgb[..., 2] > 80) & (rgb[..., 0] > rgb[..., 1])
+    return float(orange.mean())
