@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # setuptools warns of editable installs whose package lies beside pyproject.toml; ours should.
 PIP := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: help train test test-all lint bench clean
+.PHONY: help train test test-all lint bench bench-full clean
 
 help: ## What there is
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -36,7 +36,15 @@ lint: $(STAMP) ## ruff and ty
 	@$(BIN)/ty check
 
 bench: $(STAMP) ## Throughput of a whole training step
-	@$(BIN)/python benchmarks/throughput.py $(ARGS)
+	@$(BIN)/python -m benchmarks.throughput --repeats 3 $(ARGS)
+
+bench-full: $(STAMP) ## Every figure of docs/performance.md, against Brax and torch too: half an hour
+	@$(PIP) -e '.[bench]'
+	@$(BIN)/python -m benchmarks.throughput
+	@$(BIN)/python -m benchmarks.parts --out docs/profile.png
+	@$(BIN)/python -m benchmarks.comparison
+	@$(BIN)/python -m benchmarks.compile_time
+	@$(BIN)/python -m benchmarks.memory --out docs/memory.png
 
 clean: ## Remove the virtual environment and caches, not runs/
 	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis *.egg-info

@@ -271,7 +271,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
             meta = _checked_meta(meta["meta"])
             config = config_lib.from_dict(meta["config"])
             reached = meta["metrics"]
-            step = int(reached["step"])
+            step = int(reached.get("step", 0))
             curriculum = curriculum_lib.init(config).replace(
                 v_max=jnp.asarray(reached["curriculum/v_max"]),
                 cycle_time=jnp.asarray(reached["curriculum/cycle_time"]),

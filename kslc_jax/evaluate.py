@@ -8,6 +8,7 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
 
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -62,10 +63,10 @@ class Args:
 
     def __post_init__(self):
         for name in ("seeds", "seconds"):
-            if getattr(self, name) <= 0:
+            if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} must be positive")
-        if not self.speeds:
-            raise ConfigError("speeds: name at least one")
+        if not (self.speeds and all(map(math.isfinite, self.speeds))):
+            raise ConfigError("speeds: name at least one, finite")
 
 
 def measure(

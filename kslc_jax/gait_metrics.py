@@ -15,6 +15,9 @@ GRAVITY = 9.81
 SETTLE = 2.0
 """Seconds at the start that do not count: the robot gathers speed."""
 
+RESTING = 0.1
+"""Mean forward speed [m/s] below which there is no transport to have a cost."""
+
 MOMENTUM_EVERY = 0.05
 """Seconds between the samples of the limbs' angular momentum."""
 
@@ -71,10 +74,10 @@ def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     """Use of the motors, and cost of transport."""
     s = _steady(trace, dt)
     power = np.abs(s.torque * s.joint_vel).sum(-1).mean()
-    distance = max(abs(float(s.linvel[..., 0].mean())), 1e-3)
+    speed = abs(float(s.linvel[..., 0].mean()))
     load = np.abs(s.torque) / robot.effort_limit
-    return {
-        "cost_of_transport": float(power / (robot.total_mass * GRAVITY * distance)),
+    transport = float(power / (robot.total_mass * GRAVITY * speed)) if speed > RESTING else None
+    return ({} if transport is None else {"cost_of_transport": transport}) | {
         "within_speed_limits": float((np.abs(s.joint_vel) <= robot.speed_limit).all(-1).mean()),
         "peak_torque_share": float(load.max()),
         "mean_torque_share": float(load.mean()),

@@ -8,6 +8,7 @@ unless told otherwise. POLICY is a run folder, a checkpoint folder, or a shipped
 
 import contextlib
 import ipaddress
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,8 +49,10 @@ class Args:
     """MP4 to write; needs the package imageio-ffmpeg (pip install 'kslc_jax[video]')."""
 
     def __post_init__(self):
-        if self.seconds <= 0 or not self.speeds:
-            raise ConfigError("seconds must be positive, and speeds name at least one")
+        if not 0 < self.seconds < math.inf:
+            raise ConfigError("seconds must be positive")
+        if not (self.speeds and all(map(math.isfinite, self.speeds))):
+            raise ConfigError("speeds: name at least one, finite")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
 

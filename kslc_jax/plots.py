@@ -30,6 +30,9 @@ PANELS: tuple[tuple[str, str, str], ...] = (
 )
 
 
+COLUMNS = ("env_steps", "seconds", *(name for name, _, _ in PANELS))
+"""What a metrics.jsonl has to hold."""
+
 EVALUATION = "evaluation.json"
 """What `compare` calls an evaluation in a run folder."""
 
@@ -53,10 +56,13 @@ def read_metrics(path: Path) -> Records:
     path = path / "metrics.jsonl" if path.is_dir() else path
     if not path.is_file():
         raise ValueError(f"no metrics.jsonl at {path}")
-    rows = [json.loads(line) for line in path.read_text().splitlines()]
-    if not rows:
-        raise ValueError(f"{path} is empty")
-    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+    try:
+        rows = [json.loads(line) for line in path.read_text().splitlines()]
+        records = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
+        _ = [records[name] for name in COLUMNS]
+    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
+        raise ValueError(f"{path} holds no metrics of a training") from error
+    return records
 
 
 def milestones(records: Records) -> list[tuple[float, float, float]]:
@@ -149,9 +155,13 @@ def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
 
 def _save(figure, out: Path) -> None:
     figure.tight_layout()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(out, dpi=130)
-    plt.close(figure)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(out, dpi=130)
+    except OSError as error:
+        raise ValueError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        plt.close(figure)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,8 @@ def test_init_mean_scales_the_first_actions(symmetric):
     def size(init_mean):
         network = dataclasses.replace(CONFIG.network, symmetric=symmetric, init_mean=init_mean)
         config = dataclasses.replace(CONFIG, network=network)
-        return np.std(networks.policy(config, networks.init(config, KEY), history).mean)
+        mean = networks.policy(config, networks.init(config, KEY), history).mean
+        return float(np.std(np.asarray(mean)))
 
     assert size(0.01) == pytest.approx(0.01 * size(1.0), rel=1e-3)
     assert 0.1 < size(1.0) < 2.0
