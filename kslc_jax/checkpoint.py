@@ -12,6 +12,8 @@ Nothing is ever unpickled: arrays are raw numbers, everything else is JSON.
 
 import contextlib
 import json
+import shutil
+import time
 import zlib
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -174,12 +176,20 @@ class Store:
         except Exception as error:
             with contextlib.suppress(Exception):
                 self._manager.close()
+            self._clear_away()
             self._manager = ocp.CheckpointManager(self.folder, options=self._options)
             full = "No space left" in str(error)
             why = "no space left on the disk" if full else first_line(error)
             raise CheckpointError(
                 f"could not save a checkpoint: {why}; those before it are whole"
             ) from error
+
+    def _clear_away(self) -> None:
+        """Removes what a failed save left; its threads may go on writing for a moment."""
+        for _ in range(10):
+            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
+                shutil.rmtree(path, ignore_errors=True)
+            time.sleep(0.1)
 
     def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState:
         """The latest whole checkpoint, as the type of `like` (arrays or their abstract shapes).
@@ -271,7 +281,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
             meta = _checked_meta(meta["meta"])
             config = config_lib.from_dict(meta["config"])
             reached = meta["metrics"]
-            step = int(reached.get("step", 0))
+            step = int(reached.get("step", folder.name if folder.name.isdigit() else 0))
             curriculum = curriculum_lib.init(config).replace(
                 v_max=jnp.asarray(reached["curriculum/v_max"]),
                 cycle_time=jnp.asarray(reached["curriculum/cycle_time"]),
