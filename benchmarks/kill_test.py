@@ -102,6 +102,7 @@ def main(kills: int = 30, terms: int = 10, seed: int = 0, folder: Path | None = 
     """
     rng = random.Random(seed)
     folder = Path(tempfile.mkdtemp()) if folder is None else folder
+    folder.mkdir(parents=True, exist_ok=True)
     broken, whole, log = folder / "broken", folder / "whole", folder / "log.txt"
     signals = [signal.SIGKILL] * kills + [signal.SIGTERM] * terms
     rng.shuffle(signals)
