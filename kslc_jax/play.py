@@ -10,6 +10,7 @@ import contextlib
 import ipaddress
 import math
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -107,6 +108,8 @@ def write_video(path: Path, args: Args, trace, start: int, dt: float) -> None:
 
     from kslc_jax import render
 
+    # ffmpeg is started in a process of its own at once: nothing of JAX runs in the fork.
+    warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
     every = max(1, round(1.0 / (FPS * dt)))
     span = round(SPEED_SECONDS / dt)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -18,7 +18,7 @@ import pytest
 
 import kslc_jax
 from kslc_jax import checkpoint, config, curriculum, networks, play, session, trials
-from kslc_jax.config import HighFidelity, PhysicsConfig, preset
+from kslc_jax.config import PhysicsConfig, preset
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
@@ -26,9 +26,13 @@ BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 
 @pytest.fixture(scope="module")
 def still():
-    """A policy that asks for the default pose whatever it sees."""
-    params = jax.tree.map(np.zeros_like, networks.init(preset("debug"), jax.random.key(0)))
-    return checkpoint.Policy(preset("debug"), params, curriculum.init(preset("debug")), 0)
+    """A policy that asks for the default pose whatever it sees, from always the same start: one
+    config, so that all tests share what is compiled."""
+    base = preset("debug")
+    env = dataclasses.replace(base.env, reset_joint_noise=0.0)
+    quiet = dataclasses.replace(base, env=env, physics=C_MUJOCO)
+    params = jax.tree.map(np.zeros_like, networks.init(quiet, jax.random.key(0)))
+    return checkpoint.Policy(quiet, params, curriculum.init(quiet), 0)
 
 
 @pytest.fixture(scope="module")
@@ -66,17 +70,15 @@ def test_pacer_forgets_what_it_cannot_make_up_for():
 
 def test_a_session_is_a_trial(still):
     """Same start, same command, same policy: the same motion as `trials.run`."""
-    quiet = dataclasses.replace(still.config.env, reset_joint_noise=0.0)
-    exact = dataclasses.replace(still, config=dataclasses.replace(still.config, env=quiet))
     command = np.array([0.3, 0.1, 0.2])
-    trace = next(trials.run(exact, trials.Setting(C_MUJOCO), command[None]))
-    live = session.Session(exact, C_MUJOCO)
+    trace = next(trials.run(still, trials.Setting(C_MUJOCO), command[None]))
+    live = session.Session(still, C_MUJOCO)
     qpos = [live.advance(command).qpos for _ in range(80)]
     np.testing.assert_allclose(qpos, trace.qpos[:80, 0], atol=2e-5)
 
 
 def test_heading_is_kept_where_turning_ended(still):
-    live = session.Session(still, HighFidelity())
+    live = session.Session(still, C_MUJOCO)
     for _ in range(30):
         live.advance(np.array([0.0, 0.0, 0.5]))
     yaw = 2 * np.arctan2(live.view.qpos[6], live.view.qpos[3])
@@ -321,7 +323,7 @@ def test_the_page(run_dir):
             vx.fill("0.75")
             vx.press("Enter")
             page.get_by_text("of 0.75 commanded").wait_for()
-            page.locator("canvas").first.click(position={"x": 20, "y": 650})
+            page.mouse.click(20, 650)
             page.keyboard.press("i")
             page.get_by_text("of 1.00 commanded").wait_for()
             picture = page.screenshot(timeout=60_000, clip=dict(x=0, y=0, width=500, height=700))
