@@ -141,23 +141,31 @@ def finite(tree: object) -> jax.Array:
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
 
 
-def usable(state: EnvState) -> EnvState:
-    """The state of ONE environment; a non-finite one as a blank whose physics is sure to break, so
-    that `env.step` starts a new episode and nobody sees the NaN."""
+def _blank(state: EnvState) -> EnvState:
+    """A state without a number in it, whose physics is sure to break: `env.step` makes of it a new
+    episode."""
     blank = jax.tree.map(jnp.zeros_like, state)
     physics = blank.physics.replace(qvel=jnp.full_like(blank.physics.qvel, jnp.nan))
-    return maths.tree_where(finite(state), state, blank.replace(physics=physics))
+    return blank.replace(physics=physics)
+
+
+def usable(state: EnvState) -> EnvState:
+    """The state of ONE environment, or a blank where a number in it is not finite."""
+    return maths.tree_where(finite(state), state, _blank(state))
 
 
 def contain(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
-    """What ONE environment gave. Where any number is not finite the step counts as broken: it is
-    worth nothing, and its episode is over."""
-    broken = out.broken | ~finite(state) | ~finite(out)
-    lost = broken & ~(out.terminated | out.truncated)
-    physics = state.physics.replace(qvel=jnp.where(lost, jnp.nan, state.physics.qvel))
+    """What a step of ONE environment gave. Where any number is not finite the step counts as
+    broken: it is worth nothing, and a new episode follows."""
+    whole = finite(state)
+    broken = out.broken | ~whole | ~finite(out)
+    lost = ~whole | (broken & ~(out.terminated | out.truncated))
     nothing = jax.tree.map(jnp.zeros_like, out)
     nothing = nothing.replace(terminated=jnp.ones((), bool), broken=jnp.ones((), bool))
-    return usable(state.replace(physics=physics)), maths.tree_where(broken, nothing, out)
+    return (
+        maths.tree_where(lost, _blank(state), state),
+        maths.tree_where(broken, nothing, out),
+    )
 
 
 def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:

@@ -570,6 +570,43 @@ class TestNoHang:
         assert dog.limit() == 200.0
 
 
+# ----------------------------------------------------------------------------------------- doctor
+
+
+class TestDoctor:
+    def test_table_and_exit_code(self, monkeypatch, capsys):
+        good, bad = ("disk", lambda: "room", "buy one"), ("jax", lambda: 1 / 0, "install another")
+        monkeypatch.setattr(doctor, "CHECKS", (good,))
+        assert doctor.main([]) == 0
+        assert "pass" in (out := capsys.readouterr().out) and "room" in out and "buy" not in out
+        monkeypatch.setattr(doctor, "CHECKS", (good, bad))
+        assert doctor.main(["check"]) == 1
+        out = capsys.readouterr().out
+        assert "FAIL" in out and "division by zero" in out and "install another" in out
+
+    def test_what_is_quick_passes_here(self):
+        for check in (doctor.check_python, doctor.check_jax, doctor.check_cores):
+            assert check()
+
+    def test_faults_are_seen(self, tmp_path, monkeypatch):
+        (tmp_path / "file").touch()
+        monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file"))
+        monkeypatch.setattr(jax, "__version__", "0.11.0")
+        monkeypatch.setattr(doctor, "FREE_DISK", 1e9)
+        monkeypatch.setattr(
+            doctor, "_joint_angles", lambda engine: np.full(16, 0.0 if engine == "mjx" else 1e-3)
+        )
+        for check in (doctor.check_cache, doctor.check_jax, doctor.check_disk):
+            with pytest.raises((OSError, RuntimeError)):
+                check()
+        with pytest.raises(RuntimeError, match=r"1\.0e-03 rad apart after 20 steps"):
+            doctor.check_engines()
+
+    @pytest.mark.slow(reason="compiles the physics with both engines")
+    def test_engines_agree(self):
+        assert "rad apart" in doctor.check_engines()
+
+
 # ------------------------------------------------------------------------------------ determinism
 
 
