@@ -293,6 +293,9 @@ class RewardConfig:
     """Relative growth of the clearance target at the fastest command (Eq. 7)."""
     clearance_width: float = 0.01
     """Half width of HG's window, or length scale of Eq. 7's kernel as read [m]."""
+    clearance_arc: bool = False
+    """The target rises and falls with the gait clock's half sine instead of holding for the whole
+    swing: a foot held up to the last moment is stamped down."""
     joint_pos_kernel: float = 2.0
     """-beta^p of Eq. 8."""
     joint_pos_penalty: float = 0.2

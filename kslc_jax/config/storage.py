@@ -17,6 +17,7 @@ YOUNGER = {
     "config.randomize.noise",
     "config.rewards.exact_from",
     "config.rewards.exact_full",
+    "config.rewards.clearance_arc",
 }
 """Fields that older files of this version lack; their defaults are what was there before."""
 
