@@ -34,6 +34,7 @@ from kslc_jax.curriculum import Curriculum
 from kslc_jax.train_step import TrainState
 
 FOLDER = "checkpoints"
+SNAPSHOTS = "snapshots"
 POLICIES = Path(__file__).parent / "policies"
 BEST_METRIC = "score"
 
@@ -125,6 +126,14 @@ def _abstract(tree: Any) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
+def _clear_away(folder: Path) -> None:
+    """Removes what failed saves left in a folder; their threads may go on writing for a moment."""
+    for _ in range(10):
+        for path in folder.glob("*.orbax-checkpoint-tmp*"):
+            shutil.rmtree(path, ignore_errors=True)
+        time.sleep(0.1)
+
+
 class Store:
     """The checkpoints of one run folder: the latest `keep` and the best by `score`."""
 
@@ -176,20 +185,13 @@ class Store:
         except Exception as error:
             with contextlib.suppress(Exception):
                 self._manager.close()
-            self._clear_away()
+            _clear_away(self.folder)
             self._manager = ocp.CheckpointManager(self.folder, options=self._options)
             full = "No space left" in str(error)
             why = "no space left on the disk" if full else first_line(error)
             raise CheckpointError(
                 f"could not save a checkpoint: {why}; those before it are whole"
             ) from error
-
-    def _clear_away(self) -> None:
-        """Removes what a failed save left; its threads may go on writing for a moment."""
-        for _ in range(10):
-            for path in self.folder.glob("*.orbax-checkpoint-tmp*"):
-                shutil.rmtree(path, ignore_errors=True)
-            time.sleep(0.1)
 
     def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState:
         """The latest whole checkpoint, as the type of `like` (arrays or their abstract shapes).
@@ -274,7 +276,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
     Raises:
       CheckpointError: nothing there, or it cannot be read.
     """
-    folder = _checkpoint_folder(Path(path_or_name))
+    folder = checkpoint_folder(Path(path_or_name))
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
         try:
             meta = reader.restore(folder, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
@@ -300,6 +302,11 @@ def load_policy(path_or_name: str | Path) -> Policy:
     return Policy(config, params, curriculum, step)
 
 
+def policy_of(config: Config, state: TrainState) -> Policy:
+    """The policy that a training has got to."""
+    return Policy(config, state.learner.params, state.curriculum, int(state.step))
+
+
 def save_policy(policy: Policy, folder: Path) -> None:
     """Writes what `load_policy` reads and nothing else; CheckpointError if it cannot."""
     reached = policy.curriculum
@@ -314,10 +321,11 @@ def save_policy(policy: Policy, folder: Path) -> None:
         try:
             writer.save(folder.resolve(), args=ocp.args.Composite(**items))
         except (OSError, ValueError) as error:
+            _clear_away(folder.parent)
             raise CheckpointError(f"cannot write {folder}: {first_line(error)}") from error
 
 
-def _checkpoint_folder(path: Path) -> Path:
+def checkpoint_folder(path: Path) -> Path:
     """The folder of one checkpoint for a run folder, a checkpoint folder or a shipped name."""
     if not path.exists() and (POLICIES / path).is_dir():
         path = POLICIES / path

@@ -2,7 +2,8 @@
 
 Trains every variant from scratch, one after the other, each with every seed, and evaluates it over
 the commanded speeds. Unattended and resumable: what is finished is skipped, what was interrupted
-goes on from its checkpoint. Ends with one table; `python -m kslc_jax.plots performance` draws it.
+goes on from its checkpoint. Ends with one table; `python -m kslc_jax.plots` draws performance,
+momentum, and how each speed was learnt.
 
 Examples:
   python -m kslc_jax.compare --steps 20000000
@@ -92,9 +93,10 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 
 
 def run(job: Job) -> bool:
-    """Trains and evaluates; False if either failed. Each is a process of its own, whose memory and
-    compiled programs are gone with it."""
-    for module, arguments in (("train", job.train), ("evaluate", job.evaluate)):
+    """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
+    a process of its own, whose memory and compiled programs are gone with it."""
+    on_the_way = "learning", (str(job.folder),)
+    for module, arguments in (("train", job.train), on_the_way, ("evaluate", job.evaluate)):
         command = [sys.executable, "-m", f"kslc_jax.{module}", *arguments]
         if subprocess.run(command).returncode != 0:
             return False

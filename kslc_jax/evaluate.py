@@ -10,6 +10,7 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 import json
 import math
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -39,6 +40,9 @@ HEADLINE = (
 MOST_SAMPLES = 2_000_000
 """Control steps of all trials whose traces are held in memory at once, about 300 bytes each."""
 
+SHORTEST = 3.0
+"""Seconds below which nothing is left of a trial after the time to gather speed."""
+
 
 @dataclass(frozen=True)
 class Args:
@@ -62,15 +66,27 @@ class Args:
     """Where to keep the numbers."""
 
     def __post_init__(self):
-        for name in ("seeds", "seconds"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"{name} must be positive")
-        if not (self.speeds and all(map(math.isfinite, self.speeds))):
-            raise ConfigError("speeds: name at least one, finite")
+        check(self.speeds, self.seeds, self.seconds)
+
+
+def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
+    """ConfigError where there is nothing to try or to measure."""
+    if not (speeds and all(map(math.isfinite, speeds))):
+        raise ConfigError("speeds: name at least one, finite")
+    if seeds <= 0:
+        raise ConfigError("seeds must be positive")
+    if not SHORTEST <= seconds < math.inf:
+        raise ConfigError(f"seconds must be at least {SHORTEST:g}, and finite")
 
 
 def measure(
-    policy, setting, speeds, seeds: int, seed: int = 0, progress=lambda share: None
+    policy,
+    setting,
+    speeds,
+    seeds: int,
+    seed: int = 0,
+    progress=lambda share: None,
+    describe=None,
 ) -> list[dict[str, float]]:
     """One row of metrics per commanded forward speed [m/s], over `seeds` trials each.
 
@@ -81,12 +97,14 @@ def measure(
       seeds: trials per command.
       seed: of initial states and randomisation.
       progress: told the share that is done.
+      describe: the metrics of a trace; None: all of them, `gait_metrics.summary`.
     """
     import jax
     import numpy as np
 
     from kslc_jax import gait_metrics, physics, trials
 
+    describe = describe or gait_metrics.summary
     robot, dt = physics.robot_for(setting.physics), setting.physics.control_dt
     at_once = max(1, MOST_SAMPLES // (seeds * round(setting.seconds / dt)))
     rows = []
@@ -102,7 +120,7 @@ def measure(
         for i, speed in enumerate(group):
             mine = slice(i * seeds, (i + 1) * seeds)
             part = [jax.tree.map(lambda x, mine=mine: x[:, mine], piece) for piece in pieces]
-            numbers = gait_metrics.summary(trials.join(part), speed, robot, dt)
+            numbers = describe(trials.join(part), speed, robot, dt)
             rows.append({"command": speed} | numbers)
     return rows
 

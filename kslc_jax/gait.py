@@ -13,9 +13,6 @@ from kslc_jax.signals import Signals
 SOLE_DROP = 0.05
 """Height of the ankle-roll link above the sole that Humanoid-Gym subtracts [m]."""
 
-LEGS_SWING = np.array([-1.0, 1.0])
-"""Sign of the clock's sine while the left and the right leg swing."""
-
 # Reference motion per joint of the left side: share of the leg amplitude in swing (HG), of the arm
 # swing, of the elbow bend. Signs follow the joint axes: a negative left leg_pitch and knee swing
 # that leg forward and bend it; a positive left shoulder_pitch swings that arm back. The right side

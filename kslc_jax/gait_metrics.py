@@ -59,8 +59,11 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
         "forward_rmse": float(np.sqrt(np.mean((mean - command) ** 2))),
     }
     s = _steady(trace, dt)
+    if not upright.all():
+        out["seconds_to_fall"] = float(trace.alive[:, ~upright].sum(0).mean() * dt)
     if upright.any():
         out |= {
+            "forward_bias": float(mean[upright].mean() - command),
             "forward_std": float(s.linvel[..., 0].std(0).mean()),
             "lateral_std": float(s.linvel[..., 1].std(0).mean()),
             "yaw_rate_std": float(s.angvel[..., 2].std(0).mean()),

@@ -1,7 +1,8 @@
-"""Figures from stored data: python -m kslc_jax.plots {training,performance,momentum} ...
+"""Figures from stored data: python -m kslc_jax.plots {training,learning,performance,momentum} ...
 
 Examples:
   python -m kslc_jax.plots training runs/laptop-seed0 --out curve.png
+  python -m kslc_jax.plots learning runs/compare/* --out learning.png
   python -m kslc_jax.plots performance runs/compare/*/evaluation.json --out performance.png
   python -m kslc_jax.plots momentum runs/compare/*/evaluation.json --out momentum.png
 """
@@ -19,6 +20,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+
+from kslc_jax.learning import LEARNING
 
 Records = dict[str, np.ndarray]
 
@@ -107,8 +110,57 @@ def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, flo
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is no evaluation (made by evaluate --json)") from error
         name = path.resolve().parent.name if path.name == EVALUATION else path.stem
-        found.setdefault(name.rsplit("-seed", 1)[0], []).append(rows)
+        found.setdefault(_method(name), []).append(rows)
     return found
+
+
+def _method(run: str) -> str:
+    return run.rsplit("-seed", 1)[0]
+
+
+def read_learning(paths: Sequence[Path]) -> dict[str, list[list[dict]]]:
+    """Points of learning.json files, or of those in run folders, by method; ValueError."""
+    found: dict[str, list[list[dict]]] = {}
+    for path in paths:
+        file = path / LEARNING if path.is_dir() else path
+        try:
+            content = json.loads(file.read_text())
+            found.setdefault(_method(content["run"]), []).append(content["points"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{file} is no learning curve (made by kslc_jax.learning)") from error
+    return found
+
+
+def learning(methods: dict[str, list[list[dict]]], out: Path) -> None:
+    """The paper's learning curves: mean forward speed at each commanded speed over environment
+    steps; mean and range over seeds, up to where the shortest of a method ends."""
+    speeds = [row["command"] for row in next(iter(methods.values()))[0][0]["rows"]]
+    columns = min(len(speeds), 4)
+    figure, axes = plt.subplots(
+        *(-(-len(speeds) // columns), columns), figsize=(12, 6), sharex=True, squeeze=False
+    )
+    for i, (method, seeds) in enumerate(methods.items()):
+        count = min(map(len, seeds))
+        steps = [point["env_steps"] / 1e6 for point in seeds[0][:count]]
+        for j, axis in enumerate(axes.flat[: len(speeds)]):
+            reached = [[p["rows"][j]["forward_mean"] for p in points[:count]] for points in seeds]
+            values = np.array(reached)
+            axis.plot(steps, values.mean(0), "o-", color=f"C{i}", label=method, markersize=2)
+            low, high = values.min(0), values.max(0)
+            axis.fill_between(steps, low, high, color=f"C{i}", alpha=0.2, linewidth=0)
+    for axis, speed in zip(axes.flat, speeds, strict=False):
+        axis.axhline(speed, color="k", linestyle=":", linewidth=1)
+        axis.set_title(f"{speed:g} m/s commanded", fontsize=9)
+        axis.set_ylim(bottom=0)
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(speeds) :]:
+        axis.set_visible(False)
+    for axis in axes[-1]:
+        axis.set_xlabel("environment steps [millions]")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("mean forward speed [m/s]")
+    axes[0, 0].legend(fontsize=8)
+    _save(figure, out)
 
 
 def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: str, **style):
@@ -176,6 +228,17 @@ class Training:
 
 
 @dataclass(frozen=True)
+class Learning:
+    """How each commanded speed was learnt: mean forward speed over environment steps."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders in which kslc_jax.learning was run, or learning.json files; METHOD-seedN folders
+    are put together by method."""
+    out: Path = Path("learning.png")
+    """Where the figure goes."""
+
+
+@dataclass(frozen=True)
 class Performance:
     """Speed, survival and fluctuations over the commanded speed; mean and range over seeds."""
 
@@ -195,12 +258,20 @@ class Momentum:
     """Where the figure goes."""
 
 
-def draw(args: Training | Performance | Momentum) -> None:
+def draw(args: Training | Learning | Performance | Momentum) -> None:
     """Draws the asked figure; ValueError where the data is missing."""
-    if not isinstance(args, Training):
-        drawing = performance if isinstance(args, Performance) else momentum
-        drawing(read_evaluations(args.evaluations), args.out)
-        return
+    match args:
+        case Training():
+            _training(args)
+        case Learning():
+            learning(read_learning(args.runs), args.out)
+        case Performance():
+            performance(read_evaluations(args.evaluations), args.out)
+        case Momentum():
+            momentum(read_evaluations(args.evaluations), args.out)
+
+
+def _training(args: Training) -> None:
     runs = {str(path): read_metrics(path) for path in args.runs}
     for run, records in runs.items():
         print(run)
@@ -211,7 +282,7 @@ def draw(args: Training | Performance | Momentum) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    args = tyro.cli(Training | Performance | Momentum, args=argv, description=__doc__)
+    args = tyro.cli(Training | Learning | Performance | Momentum, args=argv, description=__doc__)
     try:
         draw(args)
     except ValueError as error:

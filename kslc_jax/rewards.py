@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from kslc_jax.commands import Command, speed_share
 from kslc_jax.config import RewardConfig
-from kslc_jax.gait import LEGS_SWING, SOLE_DROP, GaitState
+from kslc_jax.gait import SOLE_DROP, GaitState
 from kslc_jax.maths import norm, quat_rotate_inverse
 from kslc_jax.robot import Robot
 from kslc_jax.signals import Signals
@@ -72,10 +72,7 @@ def feet_clearance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
         near = jnp.abs(x.gait.swing_height - cfg.clearance_target) < cfg.clearance_width
         return jnp.sum(near & swing).astype(jnp.float32)
     gain = cfg.clearance_speed_gain * speed_share(x.command, x.v_max)
-    target = cfg.clearance_target * (1.0 + gain)
-    if cfg.clearance_arc:
-        target = target * jnp.maximum(x.gait.clock[0] * LEGS_SWING, 0.0)
-    error = jnp.abs(x.gait.swing_height - target)
+    error = jnp.abs(x.gait.swing_height - cfg.clearance_target * (1.0 + gain))
     return jnp.sum(jnp.exp(-error / cfg.clearance_width) * swing)
 
 

@@ -16,14 +16,14 @@ import shlex
 import signal
 import subprocess
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from types import FrameType
 
 import jax
 
+from kslc_jax import checkpoint, physics, recovery, train_step
 from kslc_jax import config as config_lib
-from kslc_jax import physics, recovery, train_step
 from kslc_jax.checkpoint import BEST_METRIC, CheckpointError, Store, first_line
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.logs import MetricsFile, Progress, write_whole
@@ -109,7 +109,7 @@ def locked(run_dir: Path) -> Generator[None]:
         yield
 
 
-def open_folder(run_dir: Path, config: Config, resume: bool) -> None:
+def open_folder(run_dir: Path, config: Config, resume: bool, origin: dict[str, str]) -> None:
     """Fills a new run folder, or checks that it may go on; RunError or ConfigError if not."""
     path = run_dir / "config.json"
     if resume:
@@ -120,7 +120,7 @@ def open_folder(run_dir: Path, config: Config, resume: bool) -> None:
             f"{run_dir} already holds a training: add --resume, or name another --run-dir"
         )
     with _writing(run_dir):
-        write_whole(run_dir / "versions.json", json.dumps(versions(), indent=1))
+        write_whole(run_dir / "versions.json", json.dumps(versions() | origin, indent=1))
         write_whole(path, json.dumps(config_lib.to_dict(config), indent=1))
 
 
@@ -172,21 +172,37 @@ def check_memory(config: Config, like: TrainState) -> None:
         )
 
 
-def train(config: Config, run_dir: Path, resume: bool, progress: Progress) -> TrainState:
+def train(
+    config: Config,
+    run_dir: Path,
+    resume: bool,
+    progress: Progress,
+    start_from: Path | None = None,
+) -> TrainState:
     """Trains until `config.run.steps`, a signal, or an error; the state is saved in each case.
+
+    Args:
+      config: what to train.
+      run_dir: where everything goes.
+      resume: go on from the run folder's latest checkpoint.
+      progress: shows it.
+      start_from: a policy whose networks and curriculum a new training begins with.
 
     Raises:
       RunError, ConfigError, CheckpointError: it cannot start, or its last state cannot be saved.
       NumbersError: numbers went bad again and again.
     """
     init, step_fn = train_step.make(config)
+    origin = {}
+    if start_from is not None:
+        init, origin = _starting_from(start_from, init)
     like = jax.eval_shape(init)
     check_memory(config, like)
     if not resume:
         with _writing(run_dir):
             run_dir.mkdir(parents=True, exist_ok=True)
     with locked(run_dir), contextlib.closing(progress):
-        open_folder(run_dir, config, resume)
+        open_folder(run_dir, config, resume, origin)
         with _writing(run_dir):
             store = Store(run_dir, config.run.keep)
         with contextlib.closing(store):
@@ -194,7 +210,7 @@ def train(config: Config, run_dir: Path, resume: bool, progress: Progress) -> Tr
             state = store.restore(like, progress.warn) if resume else init()
             if resume:
                 progress.say(f"resumed at train step {int(state.step)}")
-            compiled = step_fn.lower(state).compile()
+            compiled = step_fn.lower(like).compile()
             progress.say(f"compiled in {time.monotonic() - start:.0f} s; training")
 
             def again() -> TrainState:
@@ -206,6 +222,24 @@ def train(config: Config, run_dir: Path, resume: bool, progress: Progress) -> Tr
                 return _loop(config, run_dir, state, compiled, store, progress)
 
             return recovery.persist(config, run_dir, go, state, again, progress.warn)
+
+
+def _starting_from(
+    path: Path, init: Callable[[], TrainState]
+) -> tuple[Callable[[], TrainState], dict[str, str]]:
+    """`init` with a policy's networks and curriculum, and where they come from."""
+    policy = checkpoint.load_policy(path)
+
+    def begin() -> TrainState:
+        return train_step.start_from(init(), policy.params, policy.curriculum)
+
+    try:
+        jax.eval_shape(begin)
+    except ValueError as error:
+        raise ConfigError(
+            f"cannot start from {path}: it has {error}, see network and env.frames in its config"
+        ) from error
+    return begin, {"start_from": f"{path}, train step {policy.step}"}
 
 
 def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> TrainState:
@@ -239,6 +273,8 @@ def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> 
             if stop.requested:
                 break
             health.check()
+            if health.good and snapshot_due(config, step):
+                _keep_snapshot(config, run_dir, state, progress)
             if health.good and now - saved > 60.0 * config.run.checkpoint_minutes:
                 saved = now
                 _save(store, state, config, record, progress)
@@ -266,6 +302,20 @@ def _save(store: Store, state: TrainState, config: Config, record, progress: Pro
         store.wait()
     with _going_on(progress):
         store.save(state, config, record)
+
+
+def snapshot_due(config: Config, step: int) -> bool:
+    """Whether one of `run.snapshots` equal parts of the run ends with this train step."""
+    parts, steps = config.run.snapshots, config.num_updates
+    return step * parts // steps > (step - 1) * parts // steps
+
+
+def _keep_snapshot(config: Config, run_dir: Path, state: TrainState, progress: Progress) -> None:
+    """Saves the policy alone; one that is there, from before a resume, stays."""
+    folder = run_dir / checkpoint.SNAPSHOTS / str(int(state.step))
+    with _going_on(progress):
+        if not folder.exists():
+            checkpoint.save_policy(checkpoint.policy_of(config, state), folder)
 
 
 def _farewell(

@@ -31,9 +31,6 @@ from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig
 PUSH_SECONDS = 4.0
 """Time between pushes."""
 
-SHORTEST = 3.0
-"""Seconds below which nothing is left of a trial after the time to gather speed."""
-
 PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
     "friction": lambda mu: {"friction": (mu, mu), "ground_friction": mu},
     "payload": lambda kg: {"base_mass": (kg, kg)},
@@ -85,12 +82,7 @@ class Args:
     """Where to keep the numbers."""
 
     def __post_init__(self):
-        if self.seeds <= 0:
-            raise ConfigError("seeds must be positive")
-        if self.seconds < SHORTEST:
-            raise ConfigError(f"seconds must be at least {SHORTEST:g}")
-        if not self.speeds:
-            raise ConfigError("speeds: name at least one")
+        evaluate.check(self.speeds, self.seeds, self.seconds)
         for name in self.conditions:
             changes(name)
 

@@ -42,6 +42,9 @@ class Args:
     """Environment steps in all; short for --run.steps."""
     resume: bool = False
     """Go on from the run folder's latest checkpoint."""
+    start_from: Path | None = None
+    """Begin a new training with this policy's networks and curriculum: a run folder, a checkpoint
+    folder, or the name of a shipped policy. A lower --ppo.learning-rate keeps what it can do."""
     config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS["laptop"]
     """Every number of the training, as the preset has it."""
 
@@ -67,6 +70,8 @@ def parse(argv: list[str]) -> Args:
             name = "laptop" if helping else runtime.auto_preset()
         base = config_lib.preset(name, tuple(known.without))
     args = tyro.cli(Args, args=argv, default=Args(config=base), description=__doc__)
+    if args.resume and args.start_from:
+        raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
     config = args.config
     if args.steps is not None:
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=args.steps))
@@ -104,7 +109,7 @@ def main(argv: list[str] | None = None) -> int:
     progress = Progress(args.config)
     progress.say(f"{title}: {runner.describe(args.config, run_dir)}")
     try:
-        runner.train(args.config, run_dir, args.resume, progress)
+        runner.train(args.config, run_dir, args.resume, progress, args.start_from)
     except (ConfigError, runner.RunError, CheckpointError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

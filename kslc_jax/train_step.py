@@ -4,6 +4,8 @@
 stopped, bit for bit.
 """
 
+import dataclasses
+import functools
 from collections.abc import Callable
 
 import flax.struct
@@ -12,7 +14,7 @@ import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import env, maths, networks, ppo
-from kslc_jax.config import Config
+from kslc_jax.config import Config, RunConfig
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Gaussian, Params
@@ -50,13 +52,19 @@ class Trajectory:
 def make(
     config: Config,
 ) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
-    """(init, train_step), both jitted; train_step donates its argument."""
-    init_jit = jax.jit(lambda seed: init(config, seed))
+    """(init, train_step), both jitted; train_step donates its argument.
 
+    A process compiles a config once: its seed and how long it runs change nothing."""
+    init_jit, step_jit = _jitted(dataclasses.replace(config, seed=0, run=RunConfig()))
+    return lambda: init_jit(config.seed), step_jit
+
+
+@functools.lru_cache(maxsize=8)
+def _jitted(config: Config):
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         return step(config, state)
 
-    return lambda: init_jit(config.seed), jax.jit(train_step, donate_argnums=0)
+    return jax.jit(functools.partial(init, config)), jax.jit(train_step, donate_argnums=0)
 
 
 def init(config: Config, seed: int | jax.Array) -> TrainState:
@@ -74,6 +82,17 @@ def init(config: Config, seed: int | jax.Array) -> TrainState:
         key=key,
         step=jnp.zeros((), jnp.int32),
     )
+
+
+def start_from(state: TrainState, params: Params, curriculum: Curriculum) -> TrainState:
+    """An initial state with the networks of another training, and as far as its curriculum had
+    got; ValueError where the networks have other shapes."""
+    if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, state.learner.params):
+        raise ValueError("networks of other shapes")
+    # Copies, for a train step donates its state and another training may start from the same.
+    learner = state.learner.replace(params=jax.tree.map(jnp.copy, params))
+    curriculum = jax.tree.map(lambda x, like: x.astype(like.dtype), curriculum, state.curriculum)
+    return state.replace(learner=learner, curriculum=curriculum)
 
 
 def step(
@@ -138,7 +157,10 @@ def control_step(
 def finite(tree: object) -> jax.Array:
     """[] bool: no number of the tree is NaN or infinite."""
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
+    flags = jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]).astype(jnp.float32)
+    # A dot product, which XLA computes once: it would fuse a chain of ands into the select of every
+    # leaf that depends on it, for twice the instructions and twice the time to compile.
+    return jnp.dot(flags, jnp.ones_like(flags)) == len(leaves)
 
 
 def _blank(state: EnvState) -> EnvState:

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import commands, env, observations, physics, signals
+from kslc_jax import commands, env, networks, observations, physics, signals
 from kslc_jax.checkpoint import Policy
 from kslc_jax.config import Config, HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.curriculum import Curriculum
 from kslc_jax.robot import Fidelity
 
 NOMINAL = RandomizeConfig(
@@ -102,35 +103,48 @@ def run(
       seed: of initial states and randomisation.
       chunk: seconds per piece.
     """
-    config = trial_config(policy.config, setting, len(velocities))
-    robot = physics.robot_for(config.physics)
-    key_reset, key_run = jax.random.split(jax.random.key(seed))
-    keys = jax.random.split(key_reset, len(velocities))
+    count = len(velocities)
+    reset, advance = _programs(policy.config, setting, count, env.step)
     wanted = jnp.asarray(velocities, jnp.float32)
-    step = functools.partial(env.step, simulate=setting.simulate) if setting.simulate else env.step
-    error = _frame_error(setting)
+    key_reset, key_run = jax.random.split(jax.random.key(seed))
+    states = reset(policy.curriculum, jax.random.split(key_reset, count))
+    carry = states, jnp.ones(count, bool), states.last_action
+    steps = round(chunk / setting.physics.control_dt)
+    for i in range(round(setting.seconds / chunk)):
+        step_keys = jax.random.split(jax.random.fold_in(key_run, i), steps)
+        carry, trace = advance(policy.params, policy.curriculum, wanted, carry, step_keys)
+        yield jax.tree.map(np.asarray, trace)
 
-    def one(carry, key):
+
+@functools.lru_cache(maxsize=4)
+def _programs(trained: Config, setting: Setting, count: int, step: Callable):
+    """(reset, advance) of `count` environments, jitted once for all policies of a config."""
+    config = trial_config(trained, setting, count)
+    robot = physics.robot_for(config.physics)
+    error = _frame_error(setting)
+    if setting.simulate:
+        step = functools.partial(step, simulate=setting.simulate)
+
+    def one(policy: Policy, wanted: jax.Array, carry, key: jax.Array):
         state, alive, last_action = carry
         state = jax.vmap(lambda s, v: hold(config, s, v))(state, wanted)
         action = jax.vmap(policy.act_on)(state.history + error)
         sent = last_action if setting.latency else action
-        step_keys = jax.random.split(key, len(velocities))
+        keys = jax.random.split(key, count)
         state, outcome = jax.vmap(step, (None, 0, 0, 0, None))(
-            config, state, sent, step_keys, policy.curriculum
+            config, state, sent, keys, policy.curriculum
         )
         alive = alive & ~outcome.terminated
         return (state, alive, action), _record(robot, state, alive)
 
-    reset = jax.jit(jax.vmap(lambda k: env.reset(config, k, policy.curriculum)))
-    advance = jax.jit(lambda carry, keys: jax.lax.scan(one, carry, keys))
-    states = reset(keys)
-    carry = states, jnp.ones(len(velocities), bool), states.last_action
-    steps = round(chunk / config.control_dt)
-    for i in range(round(setting.seconds / chunk)):
-        step_keys = jax.random.split(jax.random.fold_in(key_run, i), steps)
-        carry, trace = advance(carry, step_keys)
-        yield jax.tree.map(np.asarray, trace)
+    def advance(params: networks.Params, curriculum: Curriculum, wanted, carry, keys):
+        policy = Policy(trained, params, curriculum, step=0)
+        return jax.lax.scan(functools.partial(one, policy, wanted), carry, keys)
+
+    def reset(curriculum: Curriculum, keys: jax.Array):
+        return jax.vmap(env.reset, (None, 0, None))(config, keys, curriculum)
+
+    return jax.jit(reset), jax.jit(advance)
 
 
 def _frame_error(setting: Setting) -> np.ndarray:

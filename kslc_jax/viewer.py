@@ -131,7 +131,7 @@ class Figure:
 
 def policies(given: Path) -> dict[str, Path]:
     """Name to folder: the given policy, its run's other checkpoints, and the shipped ones."""
-    folder = checkpoint._checkpoint_folder(given)
+    folder = checkpoint.checkpoint_folder(given)
     found = {str(given): folder}
     others = [p for p in folder.parent.iterdir() if p.name.isdigit() and p != folder]
     for other in sorted(others, key=lambda p: -int(p.name)):

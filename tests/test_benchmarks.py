@@ -50,6 +50,7 @@ def test_ratios_are_of_each_turn():
     assert rows["kslc_jax"]["times_slower"] == 1.0
 
 
+@pytest.mark.slow(reason="compiles a second train step")
 def test_purejaxrls_loop_learns_the_same(debug):
     """Stored and shuffled observations, or windows gathered from frames: the same parameters."""
     ours, theirs = train_step.make(debug), purejaxrl.make(debug)
@@ -109,6 +110,7 @@ def test_gym_environment_is_the_same_robot(debug):
     np.testing.assert_allclose(frames["critic"][-1], critic, atol=1e-5)
 
 
+@pytest.mark.slow(reason="compiles three programs")
 def test_throughput(tmp_path):
     """Physics alone is faster than the rollout, and that than training."""
     path = tmp_path / "numbers.json"

@@ -52,6 +52,22 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, 
     assert "failed: baseline-seed0" in out.err
 
 
+def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
+    called = []
+
+    def fake(command, **_):
+        called.append(command[2:4])
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(subprocess, "run", fake)
+    job = next(compare.jobs(compare.Args(out=tmp_path, variants=("kslc",))))
+    assert compare.run(job)
+    folder = str(tmp_path / "kslc-seed0")
+    train, *tried = called
+    assert train[0] == "kslc_jax.train"
+    assert tried == [["kslc_jax.learning", folder], ["kslc_jax.evaluate", folder]]
+
+
 @pytest.mark.parametrize("argv", [["--variants", "kslk"], ["--preset", "laptob"]])
 def test_unknown_names(argv, capsys):
     assert compare.main(argv) == 2

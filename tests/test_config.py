@@ -187,7 +187,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "command.stand_still": True,
         "gait.double_support_at_speed": -0.3,
         "gait.reference_speed_gain": 1.0,
-        "gait.arm_swing": 0.5,
+        "gait.arm_swing": 0.4,
         "gait.elbow_bend": 1.0,
         "gait.cycle_follows_speed": True,
         "gait.random_phase": True,
@@ -211,7 +211,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.weights.track_vel_hard": 0.8,
         "rewards.weights.tracking_mean_vel": 1.0,
         "rewards.weights.dof_acc": -3e-7,
-        "rewards.weights.dof_vel_limits": -3.0,
+        "rewards.weights.dof_vel_limits": -5.0,
         "rewards.weights.stand_still": -0.3,
     }
     assert LAPTOP.minibatch_size == 12_288

@@ -105,6 +105,9 @@ def learnt(folder, engine):
     return folder
 
 
+SLOW = pytest.mark.slow(reason="compiles the train step three times for four devices")
+
+
 @pytest.fixture(scope="module")
 def glided(tmp_path_factory):
     """What `learn` left, with cheap physics."""
@@ -117,24 +120,28 @@ def stepped(tmp_path_factory):
     return learnt(tmp_path_factory.mktemp("mjx"), "mjx")
 
 
-def assert_close(a: Path, b: Path, tolerance=1e-4):
+def assert_close(a: Path, b: Path, tolerance=1e-3):
+    """Sums of other orders: a mean over 128 joint accelerations is off by 2e-4 on some machines."""
     with np.load(a) as one, np.load(b) as other:
         assert set(one) == set(other) and len(one) > 50
         for name in one:
             np.testing.assert_allclose(
-                one[name], other[name], rtol=tolerance, atol=tolerance, err_msg=name
+                one[name], other[name], rtol=tolerance, atol=0.1 * tolerance, err_msg=name
             )
 
 
+@SLOW
 def test_four_devices_learn_what_one_learns(glided):
     assert_close(glided / "1.npz", glided / "4.npz")
 
 
+@SLOW
 @pytest.mark.parametrize(("before", "after"), [(1, 4), (4, 1)])
 def test_checkpoints_move_between_device_counts(before, after, glided):
     assert_close(glided / f"{before}-to-{after}.npz", glided / f"{before}.npz")
 
 
+@SLOW
 def test_one_device_reads_the_checkpoint_of_four(glided):
     """In a process that never had four."""
     with contextlib.closing(checkpoint.Store(glided / "4")) as store:
@@ -144,6 +151,7 @@ def test_one_device_reads_the_checkpoint_of_four(glided):
             np.testing.assert_array_equal(x, saved[name], err_msg=name)
 
 
+@SLOW
 def test_devices_tell_what_the_documentation_counts(glided):
     """Per train step, by the text of the program: each frame is sent once, and gradients are summed
     at one place, in the loop over minibatches."""
@@ -225,6 +233,7 @@ def test_what_cannot_be_split_is_refused(debug):
         devices.mesh(debug, jax.devices() * 4)
 
 
+@pytest.mark.slow(reason="compiles a train step of two seeds")
 def test_seeds_train_side_by_side(debug):
     """vmap over seeds gives each seed the training it has alone."""
     seeds = jnp.array([0, 1])

@@ -357,7 +357,7 @@ class TestFullDisk:
                 filler.unlink()
             return state
 
-        assert training(poison, "--run.keep", 1) == 0
+        assert training(poison, "--run.keep", 1, "--run.snapshots", 0) == 0
         out = capsys.readouterr().out
         assert "warning: could not save a checkpoint" in out and "training goes on" in out
         assert steps_of(disk) == list(range(1, 9))

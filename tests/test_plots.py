@@ -63,6 +63,30 @@ def test_figures_of_evaluations_are_drawn(figure, evaluations, tmp_path):
     assert out.stat().st_size > 10_000
 
 
+def test_learning_curves_are_drawn(tmp_path, capsys):
+    """Of runs of different lengths, as seeds of one method."""
+    for name, count in (("kslc-seed0", 5), ("kslc-seed1", 3), ("baseline-seed0", 4)):
+        points = [
+            {
+                "env_steps": 1e6 * i,
+                "rows": [{"command": v, "forward_mean": 0.2 * i * v} for v in range(5)],
+            }
+            for i in range(count)
+        ]
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "learning.json").write_text(json.dumps({"run": name, "points": points}))
+    runs = sorted(map(str, tmp_path.iterdir()))
+    assert {k: len(v) for k, v in plots.read_learning(list(tmp_path.iterdir())).items()} == {
+        "kslc": 2,
+        "baseline": 1,
+    }
+    out = tmp_path / "out.png"
+    assert plots.main(["learning", *runs, "--out", str(out)]) == 0
+    assert out.stat().st_size > 10_000
+    assert plots.main(["learning", str(tmp_path)]) == 2
+    assert "is no learning curve" in capsys.readouterr().err
+
+
 def test_not_an_evaluation(tmp_path, capsys):
     (tmp_path / "x.json").write_text("[]")
     assert plots.main(["performance", str(tmp_path / "x.json")]) == 2

@@ -1,7 +1,9 @@
 """Run folders as a person meets them: train, stop, resume, load, and what goes wrong."""
 
+import contextlib
 import ctypes.util
 import dataclasses
+import io
 import json
 import os
 import shutil
@@ -18,26 +20,19 @@ import numpy as np
 import pytest
 
 import kslc_jax
-from kslc_jax import checkpoint, runner, train, train_step
+from kslc_jax import checkpoint, learning, runner, train, train_step
 from kslc_jax.config import ConfigError, preset
 from kslc_jax.logs import MetricsFile, Progress
 
 DEBUG = ["--preset", "debug"]
 
 
-def cli(*args, check=True, **kwargs):
-    """python -m kslc_jax.train in a process of its own."""
-    done = subprocess.run(
-        [sys.executable, "-m", "kslc_jax.train", *map(str, args)],
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-        **kwargs,
-    )
-    if check:
-        assert done.returncode == 0, done.stderr
-    return done
+def cli(*args):
+    """What `python -m kslc_jax.train` prints, run in this process: it compiles once."""
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        assert train.main([str(a) for a in args]) == 0
+    return out.getvalue()
 
 
 def records(run_dir: Path):
@@ -64,15 +59,20 @@ def whole(tmp_path_factory):
     """An uninterrupted run of 8 train steps."""
     run_dir = tmp_path_factory.mktemp("runs") / "whole run"  # a path with a space
     out = cli(*DEBUG, "--run-dir", run_dir)
-    return run_dir, out.stdout
+    return run_dir, out
 
 
 def test_run_folder_and_output(whole):
     run_dir, out = whole
     assert "compiled in" in out and "steps/s" in out and "ETA" in out and "v_max" in out
-    assert {"config.json", "versions.json", "metrics.jsonl", "checkpoints", "tensorboard"} <= {
-        p.name for p in run_dir.iterdir()
-    }
+    assert {
+        "config.json",
+        "versions.json",
+        "metrics.jsonl",
+        "checkpoints",
+        "snapshots",
+        "tensorboard",
+    } <= {p.name for p in run_dir.iterdir()}
     assert runner.read_config(run_dir) == preset("debug")
     versions = json.loads((run_dir / "versions.json").read_text())
     assert versions["jax"] == jax.__version__ and "git" in versions
@@ -106,7 +106,7 @@ def wait_for(path: Path, lines: int, process):
 def unkilled(tmp_path_factory):
     """Records of a long run that nobody disturbed."""
     run_dir = tmp_path_factory.mktemp("runs") / "unkilled"
-    cli(*DEBUG, "--run-dir", run_dir, "--steps", 600 * 128)
+    cli(*DEBUG, "--run-dir", run_dir, "--steps", 200 * 128)
     return numbers(records(run_dir))
 
 
@@ -143,6 +143,35 @@ def test_first_signal_asks_second_interrupts():
             signal.raise_signal(signal.SIGINT)
 
 
+def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
+    """With its networks and as far as it had got, but a new optimiser; other networks: one line."""
+    run_dir = tmp_path / "r"
+    old = kslc_jax.load_policy(whole[0])
+    old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
+    checkpoint.save_policy(old, tmp_path / "p")
+    begin, origin = runner._starting_from(tmp_path / "p", train_step.make(preset("debug"))[0])
+    state = begin()
+    for a, b in zip(
+        jax.tree.leaves(state.learner.params), jax.tree.leaves(old.params), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    assert float(state.curriculum.v_max) == 2.5 and int(state.step) == 0
+    cli(*DEBUG, "--run-dir", run_dir, "--start-from", tmp_path / "p", "--steps", 128)
+    assert records(run_dir)[0]["curriculum/v_max"] == 2.5
+    assert json.loads((run_dir / "versions.json").read_text()) | origin == json.loads(
+        (run_dir / "versions.json").read_text()
+    )
+    again = [*DEBUG, "--run-dir", str(tmp_path / "s"), "--start-from"]
+    for args, said in (
+        ([*again, "xbot_l_run"], "cannot start from xbot_l_run: it has networks of other shapes"),
+        ([*again, "none"], "no run, checkpoint or shipped policy called 'none'"),
+        (["--resume", "--run-dir", str(run_dir), "--start-from", "x"], "take one of them"),
+    ):
+        assert train.main(args) == 2
+        assert said in capsys.readouterr().err
+    assert not (tmp_path / "s").exists()
+
+
 def test_load_policy(whole):
     run_dir, _ = whole
     policy = kslc_jax.load_policy(run_dir)
@@ -156,6 +185,36 @@ def test_load_policy(whole):
     np.testing.assert_array_equal(
         same.act(same.init(), jnp.ones(59))[1], policy.act(policy.init(), jnp.ones(59))[1]
     )
+
+
+def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
+    """Each loads as a policy; what they can do is written beside them."""
+    run_dir = tmp_path / "debug-seed0"
+    shutil.copytree(whole[0], run_dir)
+    folders = learning.snapshots(run_dir)
+    assert [p.name for p in folders] == [str(i) for i in range(1, 9)]
+    last = kslc_jax.load_policy(folders[-1])
+    final = kslc_jax.load_policy(run_dir)
+    assert (last.step, last.config) == (final.step, final.config)
+    for a, b in zip(jax.tree.leaves(last.params), jax.tree.leaves(final.params), strict=True):
+        np.testing.assert_array_equal(a, b)
+    shutil.rmtree(folders[0])
+    args = ["--speeds", "0", "1", "--seeds", "2", "--seconds", "3"]
+    assert learning.main([str(run_dir), *args]) == 0
+    points = json.loads((run_dir / learning.LEARNING).read_text())["points"]
+    assert [p["env_steps"] for p in points] == [128 * i for i in range(2, 9)]
+    assert all([row["command"] for row in p["rows"]] == [0.0, 1.0] for p in points)
+    assert learning.main([str(tmp_path), *args]) == 2
+    assert "holds no snapshots" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("parts", "due"), [(0, []), (1, [8]), (3, [3, 6, 8]), (99, [*range(1, 9)])]
+)
+def test_snapshots_are_spread_over_the_run(parts, due):
+    config = preset("debug")
+    config = dataclasses.replace(config, run=dataclasses.replace(config.run, snapshots=parts))
+    assert [s for s in range(1, 9) if runner.snapshot_due(config, s)] == due
 
 
 def test_gait_strip(whole, tmp_path):
@@ -192,7 +251,7 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(whole, tmp_path):
     cli("--resume", "--run-dir", run_dir, "--steps", 1280)
     damage(run_dir / "checkpoints" / "10")
     out = cli("--resume", "--run-dir", run_dir, "--steps", 1408)
-    assert "warning" in out.stdout and "resumed at train step 8" in out.stdout
+    assert "warning" in out and "resumed at train step 8" in out
     assert [r["step"] for r in records(run_dir)] == list(range(1, 12))
 
 
@@ -210,7 +269,8 @@ class TestErrors:
         return run
 
     def test_in_a_process_of_its_own(self):
-        done = cli("--preset", "lapto", check=False)
+        command = [sys.executable, "-m", "kslc_jax.train", "--preset", "lapto"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 2 and done.stdout == ""
         assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1
 

@@ -41,7 +41,7 @@ def test_same_seed_same_bits_and_one_trace(made):
         finals.append((state, metrics))
     assert_same(finals[0], finals[1])
     assert step._cache_size() == 1
-    other = train_step.init(config, 1)
+    other = train_step.make(dataclasses.replace(config, seed=1))[0]()
     kernels = [x.learner.params["actor"]["Dense_0"]["kernel"] for x in (other, init())]
     assert not np.array_equal(*kernels)
 

@@ -71,6 +71,8 @@ def synthetic(seconds=11.6, frequency=1.25, speed=2.0):
 
 def test_metrics_of_a_known_gait(xbot):
     m = gait_metrics.summary(synthetic(), 2.0, xbot, DT)
+    assert gait_metrics.speed(synthetic(), 1.5, DT)["forward_bias"] == pytest.approx(0.5)
+    assert "seconds_to_fall" not in m
     assert m["survival"] == 1.0 and m["forward_mean"] == pytest.approx(2.0)
     assert m["stride_frequency"] == pytest.approx(1.25, rel=0.001)
     assert m["stride_length"] == pytest.approx(1.6, rel=0.001)
@@ -105,6 +107,8 @@ def test_a_fall_counts_as_zero_speed(xbot):
     alive[500:, 1] = False
     m = gait_metrics.summary(trace.replace(alive=alive), 2.0, xbot, DT)
     assert m["survival"] == 0.5 and m["forward_mean"] == pytest.approx(1.0)
+    assert m["forward_bias"] == pytest.approx(0.0, abs=1e-6)
+    assert m["seconds_to_fall"] == pytest.approx(500 * DT)
     nobody = gait_metrics.summary(trace.replace(alive=alive & False), 2.0, xbot, DT)
     assert nobody["survival"] == 0.0 and nobody["forward_mean"] == 0.0
 

@@ -76,7 +76,6 @@ _LAPTOP = _override(
     rewards={
         "base_height_kernel": 30.0,
         "clearance_width": 0.03,
-        "clearance_arc": True,
         "max_contact_force": 1400.0,
         "lateral_distance": True,
         "lean_per_speed": 0.03,

@@ -293,9 +293,6 @@ class RewardConfig:
     """Relative growth of the clearance target at the fastest command (Eq. 7)."""
     clearance_width: float = 0.01
     """Half width of HG's window, or length scale of Eq. 7's kernel as read [m]."""
-    clearance_arc: bool = False
-    """The target rises and falls with the gait clock's half sine instead of holding for the whole
-    swing: a foot held up to the last moment is stamped down."""
     joint_pos_kernel: float = 2.0
     """-beta^p of Eq. 8."""
     joint_pos_penalty: float = 0.2
@@ -431,12 +428,15 @@ class RunConfig:
     checkpoint_minutes: float = 5.0
     keep: int = 3
     """Latest checkpoints kept, beside the best one."""
+    snapshots: int = 24
+    """Policies kept on the way, evenly over the run, for curves of how each speed was learnt."""
 
     def __post_init__(self):
         require(self.steps >= 1, "run.steps must be at least 1")
         require(self.log_every >= 1, "run.log_every must be at least 1")
         require(self.checkpoint_minutes > 0, "run.checkpoint_minutes must be positive")
         require(self.keep >= 1, "run.keep must be at least 1")
+        require(self.snapshots >= 0, "run.snapshots must not be negative")
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ YOUNGER = {
     "config.randomize.noise",
     "config.rewards.exact_from",
     "config.rewards.exact_full",
-    "config.rewards.clearance_arc",
+    "config.run.snapshots",
 }
-"""Fields that older files of this version lack; their defaults are what was there before."""
+"""Fields that older files of this version lack; their defaults give the numbers of before."""
 
 
 def to_dict(config: Config) -> dict[str, Any]:

@@ -1,0 +1,113 @@
+"""How each commanded speed was learnt: python -m kslc_jax.learning RUN [RUN ...]
+
+Tries the policies that a training kept on its way (--run.snapshots) at fixed commands, in the
+training engine, and writes learning.json into the run folder; python -m kslc_jax.plots learning
+draws it, several seeds of one method together.
+
+Examples:
+  python -m kslc_jax.learning runs/laptop-seed0 runs/laptop-seed1
+  python -m kslc_jax.plots learning runs/laptop-seed0 runs/laptop-seed1 --out learning.png
+"""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from kslc_jax import evaluate, runtime
+from kslc_jax.config import ConfigError
+
+LEARNING = "learning.json"
+"""The file's name in a run folder."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to try."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folders."""
+    speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+    """Commanded forward speeds [m/s]."""
+    seeds: int = 4
+    """Trials per speed and policy."""
+    seconds: float = 10.0
+    """Length of a trial."""
+
+    def __post_init__(self):
+        if not self.runs:
+            raise ConfigError("name at least one run")
+        evaluate.check(self.speeds, self.seeds, self.seconds)
+
+
+def snapshots(run: Path) -> list[Path]:
+    """The policies that a run kept, oldest first; ConfigError where there is none."""
+    from kslc_jax.checkpoint import SNAPSHOTS
+
+    found = sorted((p for p in run.glob(f"{SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
+    if not found:
+        raise ConfigError(f"{run} holds no snapshots (trained with --run.snapshots 0?)")
+    return found
+
+
+def _step(folder: Path) -> int:
+    return int(folder.name)
+
+
+def curve(run: Path, args: Args, progress=lambda share: None) -> dict[str, Any]:
+    """The content of learning.json: per snapshot, the speeds' survival and tracking."""
+    from kslc_jax import checkpoint, gait_metrics, trials
+
+    points = []
+    folders = snapshots(run)
+    for i, folder in enumerate(folders):
+        policy = checkpoint.load_policy(folder)
+        setting = trials.Setting(policy.config.physics, seconds=args.seconds)
+        rows = evaluate.measure(
+            policy,
+            setting,
+            args.speeds,
+            args.seeds,
+            describe=lambda trace, speed, robot, dt: gait_metrics.speed(trace, speed, dt),
+        )
+        points.append({"env_steps": policy.step * policy.config.batch_size, "rows": rows})
+        progress((i + 1) / len(folders))
+    return {
+        "run": run.resolve().name,
+        "seeds": args.seeds,
+        "seconds": args.seconds,
+        "points": points,
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    runtime.prepare()
+    from rich.progress import Progress
+
+    from kslc_jax.checkpoint import CheckpointError
+
+    try:
+        args = tyro.cli(Args, args=argv, description=__doc__)
+        for run in args.runs:
+            snapshots(run)
+        with Progress(transient=True) as bar:
+            for run in args.runs:
+                task = bar.add_task(str(run), total=1.0)
+                found = curve(run, args, lambda done, task=task: bar.update(task, completed=done))
+                (run / LEARNING).write_text(json.dumps(found, indent=1))
+                bar.console.print(f"wrote {run / LEARNING}")
+    except (CheckpointError, ConfigError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
