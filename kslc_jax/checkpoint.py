@@ -11,6 +11,7 @@ Nothing is ever unpickled: arrays are raw numbers, everything else is JSON.
 """
 
 import contextlib
+import itertools
 import json
 import shutil
 import time
@@ -215,7 +216,8 @@ class Store:
     def _put_aside(self, bad: dict[int, str], used: int, warn: Callable[[str], None]) -> None:
         """Renames what is in the way of the steps to come."""
         for step, why in bad.items():
-            aside = self.folder / f"damaged-{step}"
+            names = (f"damaged-{step}" + "-again" * i for i in itertools.count())
+            aside = next(p for p in map(self.folder.joinpath, names) if not p.exists())
             (self.folder / str(step)).rename(aside)
             warn(f"checkpoint {step} is damaged ({why}), kept as {aside.name}; {used} is used")
         if bad:
@@ -336,7 +338,18 @@ def checkpoint_folder(path: Path) -> Path:
     if (path / "params").is_dir():
         return path.resolve()
     root = path / FOLDER if (path / FOLDER).is_dir() else path
-    steps = [p for p in root.iterdir() if p.name.isdigit() and (p / "params").is_dir()]
+    steps = _steps(root)
     if not steps:
         raise CheckpointError(f"no checkpoint in {root}")
     return max(steps, key=lambda p: int(p.name)).resolve()
+
+
+def has_checkpoints(run_dir: Path) -> bool:
+    """Whether there is anything in a run folder to go on from."""
+    folder = run_dir / FOLDER
+    return folder.is_dir() and bool(_steps(folder))
+
+
+def _steps(folder: Path) -> list[Path]:
+    """The whole checkpoints in a folder, in any order."""
+    return [p for p in folder.iterdir() if p.name.isdigit() and (p / "params").is_dir()]

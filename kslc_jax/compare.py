@@ -79,9 +79,11 @@ def jobs(args: Args) -> Iterator[Job]:
 
 
 def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
+    from kslc_jax.checkpoint import has_checkpoints
+
     folder = args.out / f"{variant}-seed{seed}"
     run = ("--run-dir", str(folder), "--steps", str(args.steps))
-    if (folder / "checkpoints").is_dir():
+    if has_checkpoints(folder):
         how = ("--resume",)
     else:
         preset = args.baseline if variant == "baseline" else args.preset
@@ -95,12 +97,24 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 def run(job: Job) -> bool:
     """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
     a process of its own, whose memory and compiled programs are gone with it."""
-    on_the_way = "learning", (str(job.folder),)
-    for module, arguments in (("train", job.train), on_the_way, ("evaluate", job.evaluate)):
-        command = [sys.executable, "-m", f"kslc_jax.{module}", *arguments]
-        if subprocess.run(command).returncode != 0:
-            return False
-    return True
+    from kslc_jax.checkpoint import SNAPSHOTS
+
+    if not call("train", job.train):
+        return False
+    if (job.folder / SNAPSHOTS).is_dir() and not call("learning", (str(job.folder),)):
+        return False
+    return call("evaluate", job.evaluate)
+
+
+def call(module: str, arguments: tuple[str, ...]) -> bool:
+    """Whether a command of this package succeeded. At Ctrl-C, which it hears too, it is given the
+    time to save."""
+    process = subprocess.Popen([sys.executable, "-m", f"kslc_jax.{module}", *arguments])
+    try:
+        return process.wait() == 0
+    except KeyboardInterrupt:
+        process.wait()
+        raise
 
 
 def table(out: Path):

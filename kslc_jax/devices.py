@@ -20,8 +20,11 @@ from kslc_jax.train_step import Metrics, TrainState
 AXIS = "env"
 
 
-def join(coordinator: str, processes: int, index: int) -> None:
-    """Makes this process one of many, before JAX does anything else.
+def join(
+    coordinator: str | None = None, processes: int | None = None, index: int | None = None
+) -> None:
+    """Makes this process one of many, before JAX does anything else. Under Slurm, Open MPI,
+    Kubernetes and on TPU pods JAX finds out by itself: no argument is needed.
 
     Args:
       coordinator: host:port that process 0 listens on and all others can reach.

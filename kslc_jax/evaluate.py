@@ -9,6 +9,7 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
 import json
 import math
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -43,6 +44,9 @@ MOST_SAMPLES = 2_000_000
 SHORTEST = 3.0
 """Seconds below which nothing is left of a trial after the time to gather speed."""
 
+LONGEST = 86_400.0
+"""A day."""
+
 
 @dataclass(frozen=True)
 class Args:
@@ -59,7 +63,7 @@ class Args:
     fidelity: Literal["train", "high"] = "train"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
     noise: bool = False
-    """Sensor noise, action delay and action noise as in training."""
+    """Sensor noise, action delay and action noise, the most that training has."""
     seed: int = 0
     """Of initial states."""
     json: Path | None = None
@@ -75,8 +79,20 @@ def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
         raise ConfigError("speeds: name at least one, finite")
     if seeds <= 0:
         raise ConfigError("seeds must be positive")
-    if not SHORTEST <= seconds < math.inf:
-        raise ConfigError(f"seconds must be at least {SHORTEST:g}, and finite")
+    if not (SHORTEST <= seconds <= LONGEST and seconds == round(seconds)):
+        raise ConfigError(f"seconds must be a whole number from {SHORTEST:g} to {LONGEST:g}")
+
+
+def require_writable(path: Path | None) -> None:
+    """ConfigError where a result could not be written in the end; makes its folder."""
+    if path is None:
+        return
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ConfigError(f"cannot write {path}")
 
 
 def measure(
@@ -158,19 +174,24 @@ def console():
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
-        from rich.progress import Progress
+    from kslc_jax.checkpoint import CheckpointError
 
-        from kslc_jax.checkpoint import CheckpointError, load_policy
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     try:
-        policy = load_policy(args.policy)
+        _report(tyro.cli(Args, args=argv, description=__doc__))
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    return 0
+
+
+def _report(args: Args) -> None:
+    """Tries the policy, prints the table, keeps the numbers."""
+    from rich.progress import Progress
+
+    from kslc_jax.checkpoint import load_policy
+
+    require_writable(args.json)
+    policy = load_policy(args.policy)
     screen = console()
     with Progress(console=screen, transient=True) as bar:
         task = bar.add_task("trying", total=1.0)
@@ -178,11 +199,9 @@ def main(argv: list[str] | None = None) -> int:
     title = f"{args.policy}, train step {policy.step}, {args.fidelity} fidelity"
     screen.print(table(rows, title))
     if args.json is not None:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        what = {"policy": str(args.policy), "step": policy.step, "fidelity": args.fidelity}
-        how = {"seeds": args.seeds, "seconds": args.seconds}
+        what = {"policy": str(args.policy), "step": policy.step}
+        how = {n: getattr(args, n) for n in ("fidelity", "seeds", "seconds", "noise", "seed")}
         args.json.write_text(json.dumps({**what, **how, "rows": rows}, indent=1))
-    return 0
 
 
 if __name__ == "__main__":

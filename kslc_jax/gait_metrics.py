@@ -1,12 +1,13 @@
 """Numbers that describe how a robot moves, from a `Trace`; numpy only.
 
-All take the trace of one commanded speed, [T, N, ...], and count only trials that did not fall,
-after some time to settle; `summary` puts them together. Angular momenta are about the whole-body
-centre of mass (paper, Eq. 3).
+All take the trace of one commanded speed, [T, N, ...], after some time to settle; trials that fell
+count as 0 m/s in the mean speed and nowhere else. `summary` puts them together. Angular momenta are
+about the whole-body centre of mass (paper, Eq. 3).
 """
 
 import mujoco
 import numpy as np
+from scipy.special import stdtrit
 
 from kslc_jax.robot import Robot
 from kslc_jax.trials import Trace
@@ -45,6 +46,14 @@ def _difference(left: float, right: float) -> float:
     return abs(left - right) / max(0.5 * (abs(left) + abs(right)), 1e-6)
 
 
+def _interval(per_trial: np.ndarray) -> float:
+    """Half width of the 95 % confidence interval of a mean over trials (Student's t); 0 of one."""
+    count = len(per_trial)
+    if count < 2:
+        return 0.0
+    return float(stdtrit(count - 1, 0.975) * per_trial.std(ddof=1) / np.sqrt(count))
+
+
 def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
     """Tracking as the paper measures it: mean forward velocity, 0 for a trial that fell."""
     start = round(SETTLE / dt)
@@ -53,20 +62,23 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
     out = {
         "survival": float(upright.mean()),
         "forward_mean": float(mean.mean()),
-        "forward_mean_ci": float(1.96 * mean.std(ddof=1) / np.sqrt(len(mean)))
-        if len(mean) > 1
-        else 0.0,
+        "forward_mean_ci": _interval(mean),
         "forward_rmse": float(np.sqrt(np.mean((mean - command) ** 2))),
     }
     s = _steady(trace, dt)
     if not upright.all():
         out["seconds_to_fall"] = float(trace.alive[:, ~upright].sum(0).mean() * dt)
     if upright.any():
+        linvel, angvel = np.asarray(s.linvel), np.asarray(s.angvel)
+        swings = {
+            "forward_std": linvel[..., 0].std(0),
+            "lateral_std": linvel[..., 1].std(0),
+            "yaw_rate_std": angvel[..., 2].std(0),
+        }
+        out |= {name: float(x.mean()) for name, x in swings.items()}
+        out |= {f"{name}_ci": _interval(x) for name, x in swings.items()}
         out |= {
             "forward_bias": float(mean[upright].mean() - command),
-            "forward_std": float(s.linvel[..., 0].std(0).mean()),
-            "lateral_std": float(s.linvel[..., 1].std(0).mean()),
-            "yaw_rate_std": float(s.angvel[..., 2].std(0).mean()),
             "roll_deg": float(np.degrees(np.abs(s.euler[..., 0]).mean())),
             "pitch_deg": float(np.degrees(s.euler[..., 1].mean())),
         }
@@ -88,9 +100,10 @@ def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 
 
 def _touchdowns(contact: np.ndarray, dt: float) -> np.ndarray:
-    """Landings [N, 2] of a contact record [T, N, 2]; a foot that chatters lands once."""
+    """Landings [N, 2] of a contact record [T, N, 2]; a foot that chatters lands once, and one that
+    is down from the start has not landed."""
     window = round(CHATTER / dt)
-    padded = np.pad(contact, ((window, 0), (0, 0), (0, 0)))
+    padded = np.pad(contact, ((window, 0), (0, 0), (0, 0)), mode="edge")
     recently = np.any([padded[i : i + len(contact)] for i in range(window)], axis=0)
     return (contact & ~recently).sum(0)
 
@@ -161,7 +174,8 @@ def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
-    """Root mean square angular momentum of the whole body, and about the vertical of its parts."""
+    """Root mean square angular momentum of the whole body, its arms and its legs: all of it, and
+    about the vertical alone."""
     s = _steady(trace, dt)
     squares = (s.angular_momentum**2).mean((0, 1))
     out = {
@@ -175,16 +189,18 @@ def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
         for x in (s.linvel, s.angvel, s.joint_vel)
     )
     model, data = robot.mj_model, mujoco.MjData(robot.mj_model)
-    yaw = np.empty((len(qpos), model.nbody))
+    bodies = np.empty((len(qpos), model.nbody, 3))
     for i, q in enumerate(qpos):
         data.qpos[:] = q
         mujoco.mju_rotVecQuat(data.qvel[:3], linvel[i], q[3:7])
         data.qvel[3:6], data.qvel[6:] = angvel[i], joints[i]
-        yaw[i] = body_momentum(model, data)[:, 2]
+        bodies[i] = body_momentum(model, data)
     names = [model.body(i).name for i in range(model.nbody)]
     for part, words in {"arms": ("shoulder", "elbow"), "legs": ("leg", "knee", "ankle")}.items():
         mine = [any(f"_{word}_" in name for word in words) for name in names]
-        out[f"{part}_momentum_yaw_rms"] = float(np.sqrt(np.mean(yaw[:, mine].sum(1) ** 2)))
+        squares = (bodies[:, mine].sum(1) ** 2).mean(0)
+        out[f"{part}_momentum_rms"] = float(np.sqrt(squares.sum()))
+        out[f"{part}_momentum_yaw_rms"] = float(np.sqrt(squares[2]))
     return out
 
 

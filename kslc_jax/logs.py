@@ -17,6 +17,9 @@ from tensorboardX.summary import Summary
 
 from kslc_jax.config import Config
 
+METRICS = "metrics.jsonl"
+"""The file's name in a run folder."""
+
 PLAIN_SECONDS = 10.0
 """Seconds between progress lines where the output is no terminal."""
 
@@ -32,6 +35,12 @@ def write_whole(path: Path, text: str) -> None:
         raise
 
 
+def rows_written(run_dir: Path) -> int:
+    """Records in a run folder's metrics.jsonl."""
+    path = run_dir / METRICS
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
 class MetricsFile:
     """metrics.jsonl (one record a line) and TensorBoard events of one run folder.
 
@@ -40,7 +49,7 @@ class MetricsFile:
     """
 
     def __init__(self, run_dir: Path, after: int = 0, warn: Callable[[str], None] = print):
-        self.path = run_dir / "metrics.jsonl"
+        self.path = run_dir / METRICS
         self.seconds_before = 0.0
         """Wall time [s] that the kept records have seen."""
         kept = []

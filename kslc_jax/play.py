@@ -11,13 +11,14 @@ import ipaddress
 import math
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from kslc_jax import runtime
+from kslc_jax import evaluate, runtime
 from kslc_jax.config import ConfigError
 
 FPS = 50
@@ -83,6 +84,14 @@ def record(args: Args, policy, settle: float = 4.0):
     return jax.tree.map(lambda x: x[:stop], trace), start, engine.control_dt
 
 
+def shown(alive, start: int) -> range:
+    """The steps to show of one trial [T]: those after `start`; of one that fell, as many that end
+    with its fall."""
+    steps = len(alive)
+    fall = steps if alive[-1] else int(alive.argmin())
+    return range(max(0, fall - (steps - start)), fall) if fall else range(1)
+
+
 def caption(picture, text: str):
     """The picture [H, W, 3] with `text` in its upper left corner."""
     import numpy as np
@@ -101,23 +110,31 @@ def caption(picture, text: str):
     return np.asarray(image)
 
 
-def write_video(path: Path, args: Args, trace, start: int, dt: float) -> None:
-    """Films the speeds one after the other at real time, commanded and actual speed written in."""
-    import imageio.v2 as imageio
-    import imageio_ffmpeg  # noqa: F401 (imageio would say less clearly that it is missing)
+def film_writer():
+    """The module imageio; ImportError that says what to install."""
+    try:
+        import imageio.v2 as imageio
+        import imageio_ffmpeg  # noqa: F401 (imageio would say less clearly that it is missing)
+    except ImportError as error:
+        raise ImportError(f"films: {error} (pip install 'kslc_jax[video]')") from error
+    return imageio
 
+
+def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
+    """Films the speeds one after the other at real time, commanded and actual speed written in."""
     from kslc_jax import render
+
+    imageio = film_writer()
 
     # ffmpeg is started in a process of its own at once: nothing of JAX runs in the fork.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
     every = max(1, round(1.0 / (FPS * dt)))
     span = round(SPEED_SECONDS / dt)
-    path.parent.mkdir(parents=True, exist_ok=True)
     with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as film:
-        for i, command in enumerate(args.speeds):
-            pictures = render.frames(trace.qpos[start::every, i])
-            for step, picture in zip(range(start, len(trace.qpos), every), pictures, strict=True):
-                speed = trace.linvel[step + 1 - span : step + 1, i, 0].mean()
+        for i, (command, steps) in enumerate(zip(args.speeds, spans, strict=True)):
+            filmed = steps[::every]
+            for step, picture in zip(filmed, render.frames(trace.qpos[filmed, i]), strict=True):
+                speed = trace.linvel[max(0, step + 1 - span) : step + 1, i, 0].mean()
                 text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
                 film.append_data(caption(picture, text))
 
@@ -128,17 +145,21 @@ def draw(args: Args, policy) -> None:
 
     from kslc_jax import render
 
+    for path in (args.gait_strip, args.video):
+        evaluate.require_writable(path)
+    if args.video is not None:
+        film_writer()
     trace, start, dt = record(args, policy)
     for speed, up in zip(args.speeds, trace.alive[-1], strict=True):
         if not up:
-            print(f"warning: fell at {speed:g} m/s")
+            print(f"warning: fell at {speed:g} m/s; what is shown ends there")
+    spans = [shown(trace.alive[:, i], start) for i in range(len(args.speeds))]
     if args.gait_strip is not None:
-        strips = [render.gait_strip(trace.qpos[start:, i], dt) for i in range(len(args.speeds))]
-        args.gait_strip.parent.mkdir(parents=True, exist_ok=True)
+        strips = [render.gait_strip(trace.qpos[span, i], dt) for i, span in enumerate(spans)]
         matplotlib.image.imsave(args.gait_strip, render.stack(strips))
         print(f"wrote {args.gait_strip}")
     if args.video is not None:
-        write_video(args.video, args, trace, start, dt)
+        write_video(args.video, args, trace, spans, dt)
         print(f"wrote {args.video}")
 
 
@@ -176,7 +197,7 @@ def main(argv: list[str] | None = None) -> int:
         args = tyro.cli(Args, args=argv, description=__doc__)
         if not args.live:
             from kslc_jax import render  # noqa: F401 (before anything that imports mujoco)
-    except (ConfigError, RuntimeError) as error:
+    except (ConfigError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     from kslc_jax.checkpoint import CheckpointError, load_policy

@@ -22,6 +22,7 @@ import numpy as np
 import tyro
 
 from kslc_jax.learning import LEARNING
+from kslc_jax.logs import METRICS
 
 Records = dict[str, np.ndarray]
 
@@ -56,9 +57,9 @@ MOMENTUM: tuple[tuple[str, str], ...] = (
 
 def read_metrics(path: Path) -> Records:
     """Columns of a metrics.jsonl, or of the one in a run folder; ValueError if there is none."""
-    path = path / "metrics.jsonl" if path.is_dir() else path
+    path = path / METRICS if path.is_dir() else path
     if not path.is_file():
-        raise ValueError(f"no metrics.jsonl at {path}")
+        raise ValueError(f"no {METRICS} at {path}")
     try:
         rows = [json.loads(line) for line in path.read_text().splitlines()]
         records = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
@@ -106,11 +107,15 @@ def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, flo
     found: dict[str, list[list[dict[str, float]]]] = {}
     for path in paths:
         try:
-            rows = json.loads(path.read_text())["rows"]
+            content = json.loads(path.read_text())
+            rows = content["rows"] if "rows" in content else content["conditions"]["nominal"]
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} is no evaluation (made by evaluate --json)") from error
+            raise ValueError(f"{path} is no evaluation (of evaluate or sim2sim --json)") from error
         name = path.resolve().parent.name if path.name == EVALUATION else path.stem
         found.setdefault(_method(name), []).append(rows)
+    for name, seeds in found.items():
+        if len({tuple(row["command"] for row in rows) for rows in seeds}) > 1:
+            raise ValueError(f"the seeds of {name} were tried at different speeds")
     return found
 
 
@@ -118,47 +123,69 @@ def _method(run: str) -> str:
     return run.rsplit("-seed", 1)[0]
 
 
-def read_learning(paths: Sequence[Path]) -> dict[str, list[list[dict]]]:
-    """Points of learning.json files, or of those in run folders, by method; ValueError."""
-    found: dict[str, list[list[dict]]] = {}
+@dataclass(frozen=True)
+class Curve:
+    """How one training learnt the commanded speeds."""
+
+    env_steps: np.ndarray  # [P]
+    speeds: tuple[float, ...]  # [V] m/s, commanded
+    reached: np.ndarray  # [P, V] m/s, mean forward speed
+
+
+def read_learning(paths: Sequence[Path]) -> dict[str, list[Curve]]:
+    """Curves of learning.json files, or of those in run folders, by method, each cut to what all
+    seeds of its method have; ValueError where they do not fit together."""
+    found: dict[str, list[Curve]] = {}
     for path in paths:
         file = path / LEARNING if path.is_dir() else path
         try:
             content = json.loads(file.read_text())
-            found.setdefault(_method(content["run"]), []).append(content["points"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
+            found.setdefault(_method(content["run"]), []).append(_curve(content["points"]))
+        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{file} is no learning curve (made by kslc_jax.learning)") from error
-    return found
+    if len({curve.speeds for curves in found.values() for curve in curves}) > 1:
+        raise ValueError("the runs were tried at different speeds")
+    return {name: _aligned(name, curves) for name, curves in found.items()}
 
 
-def learning(methods: dict[str, list[list[dict]]], out: Path) -> None:
-    """The paper's learning curves: mean forward speed at each commanded speed over environment
-    steps; mean and range over seeds, up to where the shortest of a method ends."""
-    speeds = [row["command"] for row in next(iter(methods.values()))[0][0]["rows"]]
+def _curve(points: list[dict]) -> Curve:
+    return Curve(
+        np.array([point["env_steps"] for point in points]),
+        tuple(row["command"] for row in points[0]["rows"]),
+        np.array([[row["forward_mean"] for row in point["rows"]] for point in points]),
+    )
+
+
+def _aligned(name: str, curves: list[Curve]) -> list[Curve]:
+    count = min(len(curve.env_steps) for curve in curves)
+    cut = [Curve(c.env_steps[:count], c.speeds, c.reached[:count]) for c in curves]
+    if not all(np.array_equal(c.env_steps, cut[0].env_steps) for c in cut):
+        raise ValueError(f"the seeds of {name} kept their policies at different steps")
+    return cut
+
+
+def learning(methods: dict[str, list[Curve]], out: Path) -> None:
+    """The paper's learning curves: mean forward speed over environment steps, a panel per commanded
+    speed; mean and range over seeds."""
+    speeds = next(iter(methods.values()))[0].speeds
     columns = min(len(speeds), 4)
     figure, axes = plt.subplots(
         *(-(-len(speeds) // columns), columns), figsize=(12, 6), sharex=True, squeeze=False
     )
-    for i, (method, seeds) in enumerate(methods.items()):
-        count = min(map(len, seeds))
-        steps = [point["env_steps"] / 1e6 for point in seeds[0][:count]]
-        for j, axis in enumerate(axes.flat[: len(speeds)]):
-            reached = [[p["rows"][j]["forward_mean"] for p in points[:count]] for points in seeds]
-            values = np.array(reached)
+    for j, (axis, speed) in enumerate(zip(axes.flat, speeds, strict=False)):
+        for i, (method, seeds) in enumerate(methods.items()):
+            steps, values = seeds[0].env_steps / 1e6, np.array([c.reached[:, j] for c in seeds])
             axis.plot(steps, values.mean(0), "o-", color=f"C{i}", label=method, markersize=2)
             low, high = values.min(0), values.max(0)
             axis.fill_between(steps, low, high, color=f"C{i}", alpha=0.2, linewidth=0)
-    for axis, speed in zip(axes.flat, speeds, strict=False):
         axis.axhline(speed, color="k", linestyle=":", linewidth=1)
         axis.set_title(f"{speed:g} m/s commanded", fontsize=9)
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(speeds) :]:
         axis.set_visible(False)
-    for axis in axes[-1]:
-        axis.set_xlabel("environment steps [millions]")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("mean forward speed [m/s]")
+    figure.supxlabel("environment steps [millions]", fontsize=10)
+    figure.supylabel("mean forward speed [m/s]", fontsize=10)
     axes[0, 0].legend(fontsize=8)
     _save(figure, out)
 
@@ -167,8 +194,14 @@ def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: 
     """Mean over seeds of one metric over the commanded speed, and the seeds' range."""
     commands = [row["command"] for row in seeds[0]]
     values = np.array([[row.get(name, np.nan) for row in rows] for rows in seeds])
-    axis.plot(commands, values.mean(0), "o-", color=color, label=label, markersize=3, **style)
-    axis.fill_between(commands, values.min(0), values.max(0), color=color, alpha=0.2, linewidth=0)
+    # What nobody survived has no fluctuation: such seeds are left out, and the speed if all are.
+    known = ~np.isnan(values).all(0)
+    values, commands = values[:, known], np.array(commands)[known]
+    low, high = np.nanmin(values, 0), np.nanmax(values, 0)
+    axis.plot(
+        commands, np.nanmean(values, 0), "o-", color=color, label=label, markersize=3, **style
+    )
+    axis.fill_between(commands, low, high, color=color, alpha=0.2, linewidth=0)
 
 
 def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:

@@ -55,8 +55,13 @@ class Health:
 
     @property
     def good(self) -> bool:
-        """Whether the last train step was; only such states are worth saving."""
+        """Whether the last train step learnt something, from numbers that are all finite."""
         return self._bad_steps == 0
+
+    @property
+    def finite(self) -> bool:
+        """Whether the learner and the curriculum are: what a state must be to be gone on with."""
+        return self._finite
 
     def before(self, state: TrainState) -> None:
         """Keeps a copy, for the step donates `state`; during bad steps the one before them."""

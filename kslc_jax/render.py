@@ -11,7 +11,7 @@ import sys
 _BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
 
 
-class RenderError(RuntimeError):
+class RenderError(ImportError):
     """No way to render on this machine; the message says what to install."""
 
 
@@ -44,6 +44,18 @@ TALL = 2.0
 """Height that a gait strip shows at least [m]."""
 
 
+def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mujoco.Renderer:
+    """An off-screen renderer; RenderError where the chosen GL is there but does not work."""
+    try:
+        return mujoco.Renderer(model, height, width, **more)
+    except Exception as error:  # each GL fails in its own way
+        why = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise RenderError(
+            f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({why}); try the other of "
+            "egl and osmesa"
+        ) from error
+
+
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
     """A camera that looks at a point set by `lookat`."""
     cam = mujoco.MjvCamera()
@@ -57,7 +69,7 @@ def frames(
     """Pictures [height, width, 3] of a trajectory [T, 23], the camera going along at the side."""
     model = robot_lib.load("high").mj_model
     data, cam = mujoco.MjData(model), camera(distance)
-    with mujoco.Renderer(model, height, width) as renderer:
+    with _renderer(model, height, width) as renderer:
         for q in qpos:
             data.qpos[:] = q
             mujoco.mj_forward(model, data)
@@ -80,7 +92,7 @@ def gait_strip(
     cam.lookat[:] = [middle, shown[:, 1].mean(), 0.8]
     data = mujoco.MjData(model)
     fovy, model.vis.global_.fovy = model.vis.global_.fovy, LONG_LENS
-    with mujoco.Renderer(model, height, width, max_geom=20_000) as renderer:
+    with _renderer(model, height, width, max_geom=20_000) as renderer:
         for i, q in enumerate(shown):
             data.qpos[:] = q
             mujoco.mj_forward(model, data)

@@ -91,11 +91,12 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
     those at which each speed [m/s] was reached."""
     from kslc_jax import plots, runner
+    from kslc_jax.checkpoint import has_checkpoints
     from kslc_jax.logs import Progress
 
     run = dataclasses.replace(config.run, steps=round(until))
     config = dataclasses.replace(config, seed=args.seed, run=run)
-    going_on = (args.run_dir / "checkpoints").is_dir()
+    going_on = has_checkpoints(args.run_dir)
     runner.train(config, args.run_dir, going_on, Progress(config))
     records = plots.read_metrics(args.run_dir)
     return {f"{speed:g}": steps for speed, steps, _ in plots.milestones(records)}
@@ -128,6 +129,8 @@ def repeat(args: Args) -> list[Row]:
         seeds=old["seeds"],
         seconds=old["seconds"],
         fidelity=old["fidelity"],
+        noise=old.get("noise", False),
+        seed=old.get("seed", 0),
     )
     screen = evaluate.console()
     with Progress(console=screen, transient=True) as bar:

@@ -13,6 +13,7 @@ import math
 import os
 import platform
 import shlex
+import shutil
 import signal
 import subprocess
 import time
@@ -26,7 +27,7 @@ from kslc_jax import checkpoint, physics, recovery, train_step
 from kslc_jax import config as config_lib
 from kslc_jax.checkpoint import BEST_METRIC, CheckpointError, Store, first_line
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.logs import MetricsFile, Progress, write_whole
+from kslc_jax.logs import MetricsFile, Progress, rows_written, write_whole
 from kslc_jax.recovery import Health
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
@@ -64,19 +65,23 @@ class _Stop:
 def versions() -> dict[str, str]:
     """Versions that a result depends on, and the git revision if there is one."""
     found = {name: importlib.metadata.version(name) for name in PACKAGES}
-    git = subprocess.run(
-        ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
     return {
         "python": platform.python_version(),
         "machine": platform.machine(),
         "device": str(jax.devices()[0].device_kind),
-        "git": git.stdout.strip() or "unknown",
+        "git": _revision() or "unknown",
         **found,
     }
+
+
+def _revision() -> str:
+    """Of the git checkout that this file lies in; empty where there is none, or no git."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return done.stdout.strip()
 
 
 @contextlib.contextmanager
@@ -110,18 +115,20 @@ def locked(run_dir: Path) -> Generator[None]:
 
 
 def open_folder(run_dir: Path, config: Config, resume: bool, origin: dict[str, str]) -> None:
-    """Fills a new run folder, or checks that it may go on; RunError or ConfigError if not."""
-    path = run_dir / "config.json"
+    """Fills a new run folder, or checks that it may go on; RunError or ConfigError if not.
+
+    A training that ended before its first train step was saved has left nothing to lose."""
     if resume:
         difference(read_config(run_dir), config)
-        return
-    if path.exists():
+    elif checkpoint.has_checkpoints(run_dir) or rows_written(run_dir) > 1:
         raise RunError(
-            f"{run_dir} already holds a training: add --resume, or name another --run-dir"
+            f"{run_dir} already holds a training: go on with --resume --run-dir "
+            f"{shlex.quote(str(run_dir))}, or name another --run-dir"
         )
     with _writing(run_dir):
-        write_whole(run_dir / "versions.json", json.dumps(versions() | origin, indent=1))
-        write_whole(path, json.dumps(config_lib.to_dict(config), indent=1))
+        if not resume:
+            write_whole(run_dir / "versions.json", json.dumps(versions() | origin, indent=1))
+        write_whole(run_dir / "config.json", json.dumps(config_lib.to_dict(config), indent=1))
 
 
 def read_config(run_dir: Path) -> Config:
@@ -216,7 +223,9 @@ def train(
             def again() -> TrainState:
                 with _going_on(progress):
                     store.wait()
-                return store.restore(like, progress.warn) if store.steps() else init()
+                state = store.restore(like, progress.warn) if store.steps() else init()
+                _drop_snapshots(run_dir, int(state.step))
+                return state
 
             def go(state: TrainState) -> TrainState:
                 return _loop(config, run_dir, state, compiled, store, progress)
@@ -247,8 +256,9 @@ def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> 
     first = int(state.step)
     with _writing(run_dir):
         file = MetricsFile(run_dir, first, progress.warn)
-    saved = time.monotonic()
-    begun = saved - file.seconds_before
+    begun = time.monotonic() - file.seconds_before
+    # The first train step of a new run is saved, so that whatever happens there is a way back.
+    saved = time.monotonic() if store.steps() else -math.inf
     record: dict[str, float] = {}
     health, watchdog = Health(state), Watchdog()
     with _Stop() as stop, contextlib.closing(file):
@@ -276,14 +286,17 @@ def _loop(config, run_dir, state, step_fn, store: Store, progress: Progress) -> 
             if health.good and snapshot_due(config, step):
                 _keep_snapshot(config, run_dir, state, progress)
             if health.good and now - saved > 60.0 * config.run.checkpoint_minutes:
-                saved = now
                 _save(store, state, config, record, progress)
-        if record and health.good:
+                if math.isinf(saved):
+                    with _going_on(progress):
+                        store.wait()
+                saved = now
+        if record and health.finite:
             with _going_on(progress):
                 store.wait()
             store.save(state, config, record)
             store.wait()
-    _farewell(config, run_dir, int(state.step), stop.requested, health.good, progress)
+    _farewell(config, run_dir, int(state.step), stop.requested, health.finite, progress)
     return state
 
 
@@ -310,6 +323,13 @@ def snapshot_due(config: Config, step: int) -> bool:
     return step * parts // steps > (step - 1) * parts // steps
 
 
+def _drop_snapshots(run_dir: Path, after: int) -> None:
+    """Removes policies of train steps that a training went back behind: it will not pass there."""
+    for folder in (run_dir / checkpoint.SNAPSHOTS).glob("[0-9]*"):
+        if folder.name.isdigit() and int(folder.name) > after:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
 def _keep_snapshot(config: Config, run_dir: Path, state: TrainState, progress: Progress) -> None:
     """Saves the policy alone; one that is there, from before a resume, stays."""
     folder = run_dir / checkpoint.SNAPSHOTS / str(int(state.step))
@@ -319,9 +339,14 @@ def _keep_snapshot(config: Config, run_dir: Path, state: TrainState, progress: P
 
 
 def _farewell(
-    config: Config, run_dir: Path, step: int, stopped_by: str | None, good: bool, progress: Progress
+    config: Config,
+    run_dir: Path,
+    step: int,
+    stopped_by: str | None,
+    whole: bool,
+    progress: Progress,
 ) -> None:
-    saved = "saved" if good else "not saved: the numbers are not finite"
+    saved = "saved" if whole else "not saved: the numbers are not finite"
     if stopped_by:
         progress.say(
             f"stopped by {stopped_by} at train step {step}, {saved}; go on with: "

@@ -17,6 +17,7 @@ Examples:
 
 import dataclasses
 import json
+import math
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -69,7 +70,7 @@ class Args:
     seconds: float = 60.0
     """Length of a trial."""
     noise: bool = False
-    """Sensor noise, action delay and action noise as in training."""
+    """Sensor noise, action delay and action noise, the most that training has."""
     latency: bool = False
     """Every action comes one control step late."""
     perturb: tuple[str, ...] = ()
@@ -98,6 +99,8 @@ def changes(condition: str) -> dict[str, Any]:
         return {}
     name, _, value = condition.partition("=")
     try:
+        if not math.isfinite(float(value)):
+            raise ValueError
         made = PERTURBATIONS[name](float(value))
         RandomizeConfig(**{k: v for k, v in made.items() if k in _ROBOT})
     except (KeyError, ValueError):
@@ -167,23 +170,29 @@ def summary(results: Results, title: str):
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
+    from kslc_jax.checkpoint import CheckpointError
+
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
-        from rich.progress import Progress
-
-        from kslc_jax.checkpoint import CheckpointError, load_policy
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    try:
-        setting(args, "nominal")
-        policy = load_policy(args.policy)
-    except ImportError as error:
-        print(f"error: {error}; try: pip install 'kslc_jax[drake]'", file=sys.stderr)
-        return 2
+        try:
+            setting(args, "nominal")
+        except ImportError as error:
+            raise ConfigError(f"{error}; try: pip install 'kslc_jax[drake]'") from error
+        _report(args)
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    return 0
+
+
+def _report(args: Args) -> None:
+    """Tries the policy under all conditions, prints the tables, keeps the numbers."""
+    from rich.progress import Progress
+
+    from kslc_jax.checkpoint import load_policy
+
+    evaluate.require_writable(args.json)
+    policy = load_policy(args.policy)
     screen = evaluate.console()
     # Reports come once a simulated second: the estimate of the time left needs a long memory.
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
@@ -200,11 +209,10 @@ def main(argv: list[str] | None = None) -> int:
     if len(results) > 1:
         screen.print(summary(results, title))
     if args.json is not None:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
         what = {"policy": str(args.policy), "step": policy.step}
-        how = {n: getattr(args, n) for n in ("engine", "seeds", "seconds", "noise", "latency")}
+        names = ("engine", "seeds", "seconds", "noise", "latency", "seed")
+        how = {name: getattr(args, name) for name in names}
         args.json.write_text(json.dumps({**what, **how, "conditions": results}, indent=1))
-    return 0
 
 
 if __name__ == "__main__":

@@ -58,13 +58,13 @@ def parse(argv: list[str]) -> Args:
     early.add_argument("--resume", action="store_true")
     known, _ = early.parse_known_args(argv)
     helping = "-h" in argv or "--help" in argv
-    if known.resume and not helping:
+    if known.resume and known.run_dir is None and not helping:
+        raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
+    if known.resume and not helping and known.preset == "auto" and not known.without:
         from kslc_jax import runner
 
-        if known.run_dir is None:
-            raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
         base = runner.read_config(known.run_dir)
-    else:
+    else:  # also on resume: the runner names what the stored config has otherwise
         name = known.preset
         if name == "auto":
             name = "laptop" if helping else runtime.auto_preset()

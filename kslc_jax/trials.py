@@ -32,7 +32,7 @@ class Setting:
     randomize: RandomizeConfig = NOMINAL
     seconds: float = 20.0
     noise: bool = False
-    """Sensor noise, action delay and action noise as in training."""
+    """Sensor noise, action delay and action noise, the most that training has."""
     latency: bool = False
     """Every action comes one control step late."""
     imu_offset: tuple[float, float] = (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""What a person may get wrong at every command line: exit code 2, a line that names it, no
+"""What a person may get wrong at the command lines: exit code 2, a line that names it, no
 traceback, and nothing on disk touched."""
 
 import contextlib
@@ -17,7 +17,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kslc_jax import checkpoint, doctor, evaluate, play, plots, train, train_step
+from kslc_jax import checkpoint, doctor, evaluate, play, plots, sim2sim, train, train_step
 from kslc_jax.config import PRESETS, preset, to_dict
 
 few = settings(
@@ -193,10 +193,10 @@ def test_policy_loads_from_a_path_with_anything_in_it(policy):
 
 
 PICTURE = ("--gait-strip", "strip.png")
-COMMANDS = [(evaluate.main, ()), (play.main, PICTURE)]
+COMMANDS = [(evaluate.main, ()), (sim2sim.main, ()), (play.main, PICTURE)]
 
 
-@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=["evaluate", "play"])
+@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=["evaluate", "sim2sim", "play"])
 class TestPolicyCommands:
     @pytest.fixture(autouse=True)
     def any_renderer(self, monkeypatch):

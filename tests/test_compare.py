@@ -1,7 +1,11 @@
 """The matrix of trainings: which jobs there are, and that a stopped matrix goes on."""
 
 import json
+import os
+import signal
 import subprocess
+import sys
+import time
 
 import pytest
 
@@ -28,8 +32,11 @@ def test_what_a_job_runs(tmp_path):
 
 
 def test_an_interrupted_training_is_resumed(tmp_path):
+    args = compare.Args(out=tmp_path, variants=("kslc",))
     (tmp_path / "kslc-seed0" / "checkpoints").mkdir(parents=True)
-    job = next(compare.jobs(compare.Args(out=tmp_path, variants=("kslc",))))
+    assert "--resume" not in next(compare.jobs(args)).train  # nothing there to go on from
+    (tmp_path / "kslc-seed0" / "checkpoints" / "1" / "params").mkdir(parents=True)
+    job = next(compare.jobs(args))
     assert job.train[0] == "--resume" and "--preset" not in job.train
 
 
@@ -39,14 +46,14 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, 
     done.write_text(json.dumps({"rows": [{"command": 1.0, "forward_mean": 0.97}]}))
     called = []
 
-    def fake(command, **_):
-        called.append(command[2])
-        return subprocess.CompletedProcess(command, 1)
+    def fake(module, arguments):
+        called.append(module)
+        return False
 
-    monkeypatch.setattr(subprocess, "run", fake)
+    monkeypatch.setattr(compare, "call", fake)
     argv = ["--out", str(tmp_path), "--variants", "kslc", "baseline", "--seeds", "0"]
     assert compare.main(argv) == 1
-    assert called == ["kslc_jax.train"]  # of the baseline; no evaluation of a failed training
+    assert called == ["train"]  # of the baseline; no evaluation of a failed training
     out = capsys.readouterr()
     assert "done before" in out.out and "0.97" in out.out
     assert "failed: baseline-seed0" in out.err
@@ -55,17 +62,49 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, 
 def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
     called = []
 
-    def fake(command, **_):
-        called.append(command[2:4])
-        return subprocess.CompletedProcess(command, 0)
+    def fake(module, arguments):
+        called.append((module, arguments[0]))
+        return True
 
-    monkeypatch.setattr(subprocess, "run", fake)
+    monkeypatch.setattr(compare, "call", fake)
     job = next(compare.jobs(compare.Args(out=tmp_path, variants=("kslc",))))
-    assert compare.run(job)
     folder = str(tmp_path / "kslc-seed0")
-    train, *tried = called
-    assert train[0] == "kslc_jax.train"
-    assert tried == [["kslc_jax.learning", folder], ["kslc_jax.evaluate", folder]]
+    assert compare.run(job)
+    assert called == [("train", "--preset"), ("evaluate", folder)]
+    (job.folder / "snapshots").mkdir(parents=True)
+    called.clear()
+    assert compare.run(job)
+    assert called == [("train", "--preset"), ("learning", folder), ("evaluate", folder)]
+
+
+def test_an_interrupt_leaves_time_to_save(tmp_path):
+    """The child hears of it as well, and takes longer than the 0.25 s that subprocess.run gives."""
+    child = """
+import signal, sys, time
+def save(*_):
+    time.sleep(1.0)
+    open(sys.argv[1], "w").close()
+    sys.exit(0)
+signal.signal(signal.SIGINT, save)
+open(sys.argv[1] + ".ready", "w").close()
+time.sleep(60)
+"""
+    parent = f"""
+import subprocess, sys
+from kslc_jax import compare
+start = subprocess.Popen
+subprocess.Popen = lambda _: start([sys.executable, "-c", {child!r}, {str(tmp_path / "saved")!r}])
+compare.call("train", ())
+"""
+    process = subprocess.Popen(
+        [sys.executable, "-c", parent], start_new_session=True, stderr=subprocess.DEVNULL
+    )
+    while not (tmp_path / "saved.ready").exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=30) != 0
+    assert (tmp_path / "saved").exists()
 
 
 @pytest.mark.parametrize("argv", [["--variants", "kslk"], ["--preset", "laptob"]])

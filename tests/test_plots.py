@@ -1,6 +1,7 @@
 """Figures from stored data."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,11 +81,48 @@ def test_learning_curves_are_drawn(tmp_path, capsys):
         "kslc": 2,
         "baseline": 1,
     }
+    kslc = plots.read_learning([*map(Path, runs)])["kslc"]
+    assert [len(curve.env_steps) for curve in kslc] == [3, 3]
+    np.testing.assert_allclose(kslc[0].reached[2], 0.4 * np.arange(5))
     out = tmp_path / "out.png"
     assert plots.main(["learning", *runs, "--out", str(out)]) == 0
     assert out.stat().st_size > 10_000
     assert plots.main(["learning", str(tmp_path)]) == 2
     assert "is no learning curve" in capsys.readouterr().err
+    other = tmp_path / "kslc-seed1" / "learning.json"
+    other.write_text(other.read_text().replace("1000000.0", "999999.0"))
+    assert plots.main(["learning", *runs]) == 2
+    assert "the seeds of kslc kept their policies at different steps" in capsys.readouterr().err
+    other.write_text(other.read_text().replace('"command": 4', '"command": 5'))
+    assert plots.main(["learning", *runs]) == 2
+    assert "tried at different speeds" in capsys.readouterr().err
+
+
+def test_what_nobody_survived_leaves_a_gap(evaluations, tmp_path):
+    """A metric that a seed lacks, or all seeds at a speed, takes nothing away from the others."""
+    for path, speeds in zip(evaluations, ((1, 2), (1,), (1, 2)), strict=True):
+        content = json.loads(path.read_text())
+        content["rows"] = [
+            row if row["command"] in speeds else {"command": row["command"], "forward_mean": 0.0}
+            for row in content["rows"]
+        ]
+        path.write_text(json.dumps(content))
+    figure, axis = plots.plt.subplots()
+    seeds = plots.read_evaluations(evaluations)["kslc"]
+    plots._over_commands(axis, "kslc", "C0", seeds, "forward_std")
+    drawn = axis.lines[0].get_xydata()
+    plots.plt.close(figure)
+    np.testing.assert_allclose(drawn, [[1.0, 0.95], [2.0, 2.0]])
+    assert (
+        plots.main(["performance", *map(str, evaluations), "--out", str(tmp_path / "p.png")]) == 0
+    )
+
+
+def test_sim2sim_files_are_evaluations_too(evaluations, tmp_path):
+    content = json.loads(evaluations[0].read_text())
+    path = tmp_path / "sim2sim.json"
+    path.write_text(json.dumps({"conditions": {"nominal": content["rows"], "payload=5": []}}))
+    assert plots.read_evaluations([path]) == {"sim2sim": [content["rows"]]}
 
 
 def test_not_an_evaluation(tmp_path, capsys):

@@ -296,6 +296,10 @@ class TestErrors:
     def test_other_config_on_resume(self, whole, fails):
         line = fails("--resume", "--run-dir", whole[0], "--ppo.gamma", "0.9")
         assert "ppo.gamma" in line and "0.994" in line
+        line = fails("--resume", "--run-dir", whole[0], "--preset", "laptop")
+        assert "env.num_envs is 16" in line and "2048" in line
+        assert "env.arms" in fails("--resume", "--run-dir", whole[0], *DEBUG, "--without", "arms")
+        assert "unknown preset" in fails("--resume", "--run-dir", whole[0], "--preset", "lapto")
 
     def test_damaged_config(self, tmp_path, fails):
         (tmp_path / "config.json").write_text("{")
@@ -331,6 +335,40 @@ class TestErrors:
         damage(tmp_path / "r" / "checkpoints" / "8")
         with pytest.raises(checkpoint.CheckpointError, match="no readable checkpoint"):
             kslc_jax.load_policy(tmp_path / "r")
+
+
+def test_killed_before_its_first_checkpoint(whole, tmp_path, capsys):
+    """There is nothing to resume, and nothing that a new start would lose."""
+    run_dir = tmp_path / "r"
+    (run_dir / "checkpoints").mkdir(parents=True)
+    shutil.copy(whole[0] / "config.json", run_dir)
+    (run_dir / "metrics.jsonl").write_text('{"step": 1}\n{"torn')
+    assert train.main(["--resume", "--run-dir", str(run_dir)]) == 2
+    assert "no checkpoint" in capsys.readouterr().err
+    cli(*DEBUG, "--run-dir", run_dir)
+    assert numbers(records(run_dir)) == numbers(records(whole[0]))
+    shutil.rmtree(run_dir / "checkpoints")  # but eight records are something to lose
+    assert train.main([*DEBUG, "--run-dir", str(run_dir)]) == 2
+    assert "already holds a training" in capsys.readouterr().err
+
+
+def test_the_first_train_step_is_saved_at_once(tmp_path):
+    run = dataclasses.replace(preset("debug").run, steps=256, checkpoint_minutes=60.0)
+    config = dataclasses.replace(preset("debug"), run=run)
+    runner.train(config, tmp_path / "r", resume=False, progress=Progress(config))
+    assert checkpoint.Store(tmp_path / "r").steps() == [1, 2]
+
+
+def test_a_longer_run_is_remembered(whole, tmp_path):
+    """What is stopped after --resume --steps goes on to the same end without --steps."""
+    shutil.copytree(whole[0], tmp_path / "r")
+    cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1152)
+    assert runner.read_config(tmp_path / "r").run.steps == 1152
+
+
+def test_git_is_not_needed(monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    assert runner.versions()["git"] == "unknown"
 
 
 def test_every_field_can_be_overridden():

@@ -48,7 +48,8 @@ def synthetic(seconds=11.6, frequency=1.25, speed=2.0):
     t = np.arange(0, seconds, DT)
     n, steps = 2, len(t)
     cycle = round(1.0 / (frequency * DT))  # in steps, so that rounding favours no side
-    left, right = ((np.arange(steps) + shift) % cycle < 0.4 * cycle for shift in (0, cycle // 2))
+    shifts = (cycle // 4, cycle // 4 + cycle // 2)  # nobody lands at the first sample that counts
+    left, right = ((np.arange(steps) + shift) % cycle < 0.4 * cycle for shift in shifts)
     contact = np.stack([left, right], -1)[:, None].repeat(n, 1)
     q = np.zeros((steps, n, 23))
     swing = np.sin(2 * np.pi * frequency * t)[:, None]

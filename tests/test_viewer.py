@@ -2,8 +2,10 @@
 
 import dataclasses
 import io
+import os
 import shutil
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -18,7 +20,7 @@ import pytest
 
 import kslc_jax
 from kslc_jax import checkpoint, config, curriculum, networks, play, session, trials
-from kslc_jax.config import PhysicsConfig, preset
+from kslc_jax.config import ConfigError, PhysicsConfig, preset
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
@@ -276,13 +278,45 @@ def test_video_carries_the_speeds(monkeypatch, tmp_path):
     linvel = np.zeros((150, 2, 3))
     linvel[..., 0] = 0.9, 2.1
     trace = SimpleNamespace(qpos=np.zeros((150, 2, 23)), linvel=linvel)
-    play.write_video(tmp_path / "a" / "out.mp4", args, trace, start=100, dt=0.01)
-    frames = imageio.mimread(tmp_path / "a" / "out.mp4", memtest=False)
+    play.write_video(tmp_path / "out.mp4", args, trace, [range(100, 150)] * 2, dt=0.01)
+    frames = imageio.mimread(tmp_path / "out.mp4", memtest=False)
     assert len(frames) == 50 and max(f.max() for f in frames) > 200
     assert set(said) == {
         "commanded 1.0 m/s\nactual 0.90 m/s",
         "commanded 2.0 m/s\nactual 2.10 m/s",
     }
+
+
+@pytest.mark.parametrize(
+    ("fall", "steps"), [(150, (100, 150)), (120, (70, 120)), (30, (0, 30)), (0, (0, 1))]
+)
+def test_what_is_shown_ends_with_the_fall(fall, steps):
+    assert play.shown(np.arange(150) < fall, start=100) == range(*steps)
+
+
+def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "kslc_jax.render", SimpleNamespace())
+    monkeypatch.setattr(kslc_jax, "render", SimpleNamespace(), raising=False)
+    monkeypatch.setattr(play, "record", None)
+    (tmp_path / "file").touch()
+    for name in ("gait_strip", "video"):
+        args = play.Args(Path("x"), **{name: tmp_path / "file" / "out"})
+        with pytest.raises(ConfigError, match="cannot write"):
+            play.draw(args, None)
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ImportError, match=r"pip install 'kslc_jax\[video\]'"):
+        play.draw(play.Args(Path("x"), video=tmp_path / "out.mp4"), None)
+
+
+def test_a_gl_that_does_not_work_is_named(tmp_path):
+    command = [
+        *(sys.executable, "-m", "kslc_jax.play", "xbot_l_run", "--speeds", "1", "--seconds", "0.1"),
+        *("--gait-strip", str(tmp_path / "never.png")),
+    ]
+    env = {**os.environ, "MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "nonsense"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    assert done.returncode == 2 and len(done.stderr.strip().splitlines()) == 1
+    assert done.stderr.startswith("error: ")
 
 
 # -------------------------------------------------------------------------------------------- page

@@ -59,7 +59,7 @@ _LAPTOP = _override(
     gait={
         "double_support_at_speed": -0.3,
         "reference_speed_gain": 1.0,
-        "arm_swing": 0.4,
+        "arm_swing": 0.5,
         "elbow_bend": 1.0,
         "cycle_follows_speed": True,
         "random_phase": True,
@@ -86,7 +86,7 @@ _LAPTOP = _override(
             "track_vel_hard": 0.8,
             "tracking_mean_vel": 1.0,
             "dof_acc": -3e-7,
-            "dof_vel_limits": -5.0,
+            "dof_vel_limits": -3.0,
             "stand_still": -0.3,
         },
     },

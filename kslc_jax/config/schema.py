@@ -121,6 +121,8 @@ class EnvConfig:
         require(self.frames >= 1, "env.frames must be at least 1")
         require(self.privileged_frames >= 1, "env.privileged_frames must be at least 1")
         require(0 <= self.action_delay <= 1, "env.action_delay must lie in [0, 1]")
+        require(self.action_clip > 0, "env.action_clip must be positive")
+        require(self.observation_clip > 0, "env.observation_clip must be positive")
         for name in ("action_noise", "noise_level", "reset_joint_noise"):
             require(getattr(self, name) >= 0, f"env.{name} must not be negative")
 
@@ -358,6 +360,7 @@ class CurriculumConfig:
     def __post_init__(self):
         require(0 < self.cycle_factor <= 1, "curriculum.cycle_factor must lie in (0, 1]")
         require(self.v_step > 0, "curriculum.v_step must be positive")
+        require(self.v_start > 0, "curriculum.v_start must be positive")
         require(
             self.v_min <= self.v_start <= self.v_limit,
             "curriculum needs v_min <= v_start <= v_limit",
@@ -412,6 +415,9 @@ class PPOConfig:
             require(getattr(self, name) >= 1, f"ppo.{name} must be at least 1")
         require(0 <= self.gamma <= 1, "ppo.gamma must lie in [0, 1]")
         require(0 <= self.lam <= 1, "ppo.lam must lie in [0, 1]")
+        for name in ("clip", "max_grad_norm", "desired_kl"):
+            require(getattr(self, name) > 0, f"ppo.{name} must be positive")
+        require(self.learning_rate_factor >= 1, "ppo.learning_rate_factor must be at least 1")
         _check_range("ppo.learning_rate_bounds", self.learning_rate_bounds)
         low, high = self.learning_rate_bounds
         require(low <= self.learning_rate <= high, "ppo.learning_rate must lie within its bounds")
