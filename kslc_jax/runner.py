@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import jax
 
@@ -203,8 +204,7 @@ def train(
     origin = {}
     if start_from is not None:
         init, origin = _starting_from(start_from, init)
-    like = jax.eval_shape(init)
-    check_memory(config, like)
+    check_memory(config, jax.eval_shape(init))
     if not resume:
         with _writing(run_dir):
             run_dir.mkdir(parents=True, exist_ok=True)
@@ -213,24 +213,38 @@ def train(
         with _writing(run_dir):
             store = Store(run_dir, config.run.keep)
         with contextlib.closing(store):
-            start = time.monotonic()
-            state = store.restore(like, progress.warn) if resume else init()
-            if resume:
-                progress.say(f"resumed at train step {int(state.step)}")
-            compiled = step_fn.lower(like).compile()
-            progress.say(f"compiled in {time.monotonic() - start:.0f} s; training")
+            return _persist(config, run_dir, resume, progress, store, init, step_fn)
 
-            def again() -> TrainState:
-                with _going_on(progress):
-                    store.wait()
-                state = store.restore(like, progress.warn) if store.steps() else init()
-                _drop_snapshots(run_dir, int(state.step))
-                return state
 
-            def go(state: TrainState) -> TrainState:
-                return _loop(config, run_dir, state, compiled, store, progress)
+def _persist(
+    config: Config,
+    run_dir: Path,
+    resume: bool,
+    progress: Progress,
+    store: Store,
+    init: Callable[[], TrainState],
+    step_fn: Any,
+) -> TrainState:
+    """Compiles and trains; goes back to a checkpoint where numbers go bad."""
+    like = jax.eval_shape(init)
+    start = time.monotonic()
+    state = store.restore(like, progress.warn) if resume else init()
+    if resume:
+        progress.say(f"resumed at train step {int(state.step)}")
+    compiled = step_fn.lower(like).compile()
+    progress.say(f"compiled in {time.monotonic() - start:.0f} s; training")
 
-            return recovery.persist(config, run_dir, go, state, again, progress.warn)
+    def again() -> TrainState:
+        with _going_on(progress):
+            store.wait()
+        state = store.restore(like, progress.warn) if store.steps() else init()
+        _drop_snapshots(run_dir, int(state.step))
+        return state
+
+    def go(state: TrainState) -> TrainState:
+        return _loop(config, run_dir, state, compiled, store, progress)
+
+    return recovery.persist(config, run_dir, go, state, again, progress.warn)
 
 
 def _starting_from(
