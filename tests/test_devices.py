@@ -215,6 +215,7 @@ def test_two_processes_learn_what_one_learns(stepped, tmp_path):
     assert_close(files[0], stepped / "1.npz")
 
 
+@pytest.mark.slow(reason="compiles a second train step")
 def test_one_device_is_a_mesh_too(debug):
     """A mesh of one device changes no bit, and takes the mujoco engine."""
     finals = []

@@ -158,6 +158,7 @@ def test_jit_equals_no_jit_and_batch_of_one():
         np.testing.assert_allclose(b, c[0], rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow(reason="compiles MJX; test_physics.py compares the engines in the quick suite")
 def test_engines_give_the_same_environment():
     """The same 10 steps through mjx and mujoco: frames agree to 1e-3."""
     frames = []

@@ -425,7 +425,9 @@ class TestDamage:
         saved(tmp_path, 1)
         files = (tmp_path / "checkpoints" / "1" / "params" / "ocdbt.process_0" / "d").iterdir()
         flip_a_bit(max(files, key=lambda p: p.stat().st_size))
-        with pytest.raises(CheckpointError, match="the numbers of 'params' are not those"):
+        # Orbax sees it in the index, the checksum in the numbers.
+        said = "the numbers of 'params' are not those|Encountered error while reading"
+        with pytest.raises(CheckpointError, match=said):
             checkpoint.load_policy(tmp_path)
 
     def test_changed_meta(self, saved, restored, tmp_path):

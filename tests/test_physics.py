@@ -87,10 +87,10 @@ def test_servo_control_inverts_the_models_servo(xbot):
     ids=["mjx", "mujoco", "high fidelity"],
 )
 def test_no_motor_drives_a_joint_past_its_speed_limit(config):
-    """Shoulders, then knees, at full command in the air: 7 and 12 rad/s are approached. At 5 ms the
-    reaction of the limbs that hang on them carries them a little past it."""
+    """Shoulders, then knees, at full command in the air: 7 and 12 rad/s are approached. At 5 ms one
+    step of full torque, chosen below the limit, adds up to 4 rad/s to a knee."""
     step = jax.jit(lambda s, t, d: physics.step(config, s, t, d, GROUND))
-    for joints, there, limit in (((12, 14), 3.1, 7.0), ((3, 9), 1.2, 12.0)):
+    for joints, there, limit, over in (((12, 14), 3.1, 7.0, 1.0), ((3, 9), 1.2, 12.0, 4.0)):
         state = standing(config)
         state = state.replace(qpos=state.qpos.at[2].set(3.0))
         target = jnp.zeros(16).at[jnp.array(joints)].set(jnp.array([-there, there]))
@@ -98,7 +98,7 @@ def test_no_motor_drives_a_joint_past_its_speed_limit(config):
         for _ in range(30):
             state = step(state, target, randomize.nominal())
             fastest = max(fastest, float(jnp.abs(state.qvel[6 + jnp.array(joints)]).max()))
-        assert 0.75 * limit < fastest <= limit * (1.0 if config.timestep == 0.001 else 1.15)
+        assert 0.75 * limit < fastest <= (limit if config.timestep == 0.001 else limit + over)
 
 
 @pytest.fixture(scope="module")

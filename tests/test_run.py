@@ -110,7 +110,13 @@ def unkilled(tmp_path_factory):
     return numbers(records(run_dir))
 
 
-@pytest.mark.parametrize("sig", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "sig",
+    [
+        signal.SIGKILL,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow(reason="half a minute, like SIGKILL")),
+    ],
+)
 def test_killed_run_resumes_with_the_same_numbers(sig, unkilled, tmp_path):
     """Killed in mid-run: what follows from the last checkpoint equals the unkilled run."""
     run_dir = tmp_path / "r"
@@ -217,6 +223,7 @@ def test_snapshots_are_spread_over_the_run(parts, due):
     assert [s for s in range(1, 9) if runner.snapshot_due(config, s)] == due
 
 
+@pytest.mark.slow(reason="compiles, simulates and draws in software, half a minute")
 def test_gait_strip(whole, tmp_path):
     """Draws where an off-screen GL is installed; says in one line what to install where not."""
     out = tmp_path / "strip.png"

@@ -145,7 +145,7 @@ def test_report(random_policy, monkeypatch, tmp_path, capsys):
     ("argv", "says"),
     [
         (["no-such-policy"], "no run, checkpoint or shipped policy"),
-        (["x", "--seconds", "2"], "seconds must be at least 3"),
+        (["x", "--seconds", "2"], "seconds must be a whole number from 3"),
         (["x", "--seeds", "0"], "seeds must be positive"),
         (["x", "--perturb", "wind=3"], "cannot read 'wind=3'"),
     ],
