@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from rich import box
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -185,8 +186,11 @@ class Progress:
         return "  ".join(f"{name} {value}" for name, value in self._headline(record).items())
 
     def _table(self, record: dict[str, float]) -> Table:
-        """Headline above the reward terms with their weights."""
-        table = Table(title=self._line(record), title_justify="left", title_style="bold")
+        """Headline beside the reward terms with their weights; fits into 80 columns."""
+        head = Table.grid(padding=(0, 1))
+        for name, value in self._headline(record).items():
+            head.add_row(name, f"[bold]{value}")
+        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for column in ("reward term", "value", "weight", "weighted"):
             table.add_column(column, justify="left" if column == "reward term" else "right")
         weights = self.config.rewards.weights
@@ -196,4 +200,6 @@ class Progress:
                 continue
             weight = getattr(weights, term)
             table.add_row(term, f"{value:.4g}", f"{weight:g}", f"{weight * value:+.4f}")
-        return table
+        both = Table.grid(padding=(0, 1))
+        both.add_row(head, table)
+        return both

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import matplotlib.image
 import numpy as np
 import pytest
+from rich.console import Console
 
 import kslc_jax
 from kslc_jax import checkpoint, learning, runner, train, train_step
@@ -412,6 +413,30 @@ def test_versions_known_to_hang_are_refused():
         runtime.check_jax(bad, "gpu")
     for good in ("0.7.2", "0.9.2", "0.11.1", "0.12.0.1"):
         runtime.check_jax(good, "cpu")
+
+
+def test_progress_fits_into_80_columns():
+    """The live table: all that matters is readable on the narrowest usual terminal."""
+    record = dict.fromkeys(
+        ["env_steps", "steps_per_second", "seconds", "episode_steps", "tracking", "fast_tracking"],
+        1.0,
+    ) | {"curriculum/v_max": 3.5, "curriculum/cycle_time": 0.64, "reward/dof_acc": 481234.5}
+    record["reward/feet_contact_number"] = 0.9231
+    screen = Console(file=io.StringIO(), force_terminal=True, width=80, color_system=None)
+    progress = Progress(preset("laptop"), screen)
+    screen.print(progress._table(record))
+    out = screen.file.getvalue()
+    for word in (
+        "v_max",
+        "3.5 m/s",
+        "ETA",
+        "1/2400",
+        "feet_contact_number",
+        "+1.8462",
+        "4.812e+05",
+    ):
+        assert word in out
+    assert max(map(len, out.splitlines())) <= 80
 
 
 def test_progress_prints_a_line_without_a_terminal(capsys):
