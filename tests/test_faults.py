@@ -68,6 +68,13 @@ def same(a, b):
     return all(np.array_equal(x, y, equal_nan=x.dtype.kind == "f") for x, y in pairs)
 
 
+def the_error(capsys):
+    """The one line that says what is wrong. Threads of orbax whose disk was full, tests ago, may
+    still be writing tracebacks."""
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
+    return line
+
+
 def put(tree, where, value, rows=slice(None)):
     """`tree` with `value` in the rows of the field named by a dotted path."""
     name, _, rest = where.partition(".")
@@ -388,7 +395,7 @@ class TestFullDisk:
         subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
         for folder in (disk, disk / "new"):
             assert train.main(["--preset", "debug", "--run-dir", str(folder)]) == 2
-            (line,) = capsys.readouterr().err.splitlines()
+            line = the_error(capsys)
             assert line.startswith(f"error: cannot write to {folder}: Read-only")
 
 
@@ -524,7 +531,7 @@ class TestLock:
     def test_names_the_process(self, tmp_path, capsys):
         with runner.locked(tmp_path):
             assert train.main(["--preset", "debug", "--run-dir", str(tmp_path)]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        line = the_error(capsys)
         assert line == f"error: {tmp_path} is in use by another process, id {os.getpid()}"
         assert [p.name for p in tmp_path.iterdir()] == [".lock"]
 

@@ -47,8 +47,8 @@ class PhysicsConfig:
     fidelity: ClassVar[Literal["train", "high"]] = "train"
 
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
-    """mjx: pure XLA, any device. mujoco: C MuJoCo on all CPU cores behind one callback, over twice
-    as fast on a CPU. auto: mjx on an accelerator, mujoco without one."""
+    """mjx: pure XLA, any device. mujoco: C MuJoCo on all CPU cores behind one callback, faster on
+    a CPU (docs/performance.md). auto: mjx on an accelerator, mujoco without one."""
     timestep: float = 0.005
     """Physics step [s]; the PD torque is recomputed at each one."""
     decimation: int = 2
