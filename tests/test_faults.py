@@ -564,11 +564,11 @@ class TestNoHang:
         dog = runtime.Watchdog(factor=2.0, least=0.2, first=0.2)
         with dog.step():
             time.sleep(0.01)
-        assert capfd.readouterr().err == ""
+        assert "Timeout" not in capfd.readouterr().err
         with dog.step():
             time.sleep(0.5)
         err = capfd.readouterr().err
-        assert err.startswith("Timeout") and "test_watchdog_shows_where" in err
+        assert "Timeout" in err and "test_watchdog_shows_where" in err
 
     def test_watchdogs_limit(self):
         dog = runtime.Watchdog()
