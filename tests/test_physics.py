@@ -83,7 +83,11 @@ def test_servo_control_inverts_the_models_servo(xbot):
 
 @pytest.mark.parametrize(
     "config",
-    [PhysicsConfig(engine="mjx"), PhysicsConfig(engine="mujoco"), HighFidelity()],
+    [
+        pytest.param(PhysicsConfig(engine="mjx"), marks=pytest.mark.slow(reason="compiles MJX")),
+        PhysicsConfig(engine="mujoco"),
+        HighFidelity(),
+    ],
     ids=["mjx", "mujoco", "high fidelity"],
 )
 def test_no_motor_drives_a_joint_past_its_speed_limit(config):

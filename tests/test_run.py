@@ -194,6 +194,7 @@ def test_load_policy(whole):
     )
 
 
+@pytest.mark.slow(reason="compiles trials of the policies, half a minute")
 def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
     """Each loads as a policy; what they can do is written beside them."""
     run_dir = tmp_path / "debug-seed0"
