@@ -69,11 +69,11 @@ class Controller:
 
 
 def motor_torque(m, target, q, dq):
-    """PD torque [N m]; driving torque falls to zero at the joint's speed limit, braking keeps."""
+    """PD torque [N m]; driving torque falls to zero at the speed limit and brakes beyond it."""
     pd = np.asarray(m.kp) * (target - q) - np.asarray(m.kd) * dq
     full, top = np.asarray(m.effort_limit), np.asarray(m.speed_limit)
     upper, lower = ((top - s * dq) / ((1 - m.torque_knee) * top) for s in (1, -1))
-    return np.clip(pd, -full * np.clip(lower, 0, 1), full * np.clip(upper, 0, 1))
+    return np.clip(pd, -full * np.clip(lower, -1, 1), full * np.clip(upper, -1, 1))
 
 
 def simulate(controller, model, seconds):

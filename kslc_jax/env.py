@@ -54,7 +54,7 @@ class Outcome:
     settled: jax.Array  # [] bool: the command has been the same for a while
     fast: jax.Array  # [] bool: and it was in the top part of the range
     episode_steps: jax.Array  # [] int, length of the episode so far
-    speeding: jax.Array  # [] bool: some joint is over its speed limit
+    speeding: jax.Array  # [] bool: some joint is at its speed limit, or over it
 
 
 def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
@@ -152,7 +152,7 @@ def step(
         settled=settled,
         fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
         episode_steps=time,
-        speeding=jnp.any(jnp.abs(now.joint_vel) > robot.speed_limit),
+        speeding=jnp.any(jnp.abs(now.joint_vel) >= robot.speed_limit),
     )
     state = state.replace(
         physics=new,

@@ -18,6 +18,7 @@ SOLE_DROP = 0.05
 # that leg forward and bend it; a positive left shoulder_pitch swings that arm back. The right side
 # has mirrored axes.
 _LEG = {"leg_pitch": 1.0, "knee": 2.0, "ankle_pitch": 1.0}
+_HIP = {"leg_pitch": 1.0}
 _ARM = {"shoulder_pitch": 1.0}
 _ELBOW = {"elbow_pitch": 1.0}
 
@@ -118,9 +119,9 @@ def reference_pose(
 ) -> jax.Array:
     """Reference joint angles [16, rad] of Humanoid-Gym, with amplitudes that grow with the speed.
 
-    The swing leg follows a half sine; with `arm_swing` the arms follow the cosine, against the leg
-    of their side, and with `elbow_bend` the elbows flex. All zero at their Humanoid-Gym settings
-    but the legs.
+    The swing leg follows a half sine; with `stride_sweep` the hips and with `arm_swing` the arms
+    follow the cosine, against each other on each side, and with `elbow_bend` the elbows flex. All
+    zero at their Humanoid-Gym settings but the half sine.
     """
     share = _share_of_full_speed(config, command)
     s, c = state.clock
@@ -130,9 +131,11 @@ def reference_pose(
         _pattern(robot, "left", _LEG) * jnp.minimum(swing, 0.0)
         + _pattern(robot, "right", _LEG) * jnp.maximum(swing, 0.0)
     )
+    hips = _pattern(robot, "left", _HIP) + _pattern(robot, "right", _HIP)
     arms = _pattern(robot, "left", _ARM) + _pattern(robot, "right", _ARM)
     elbows = _pattern(robot, "left", _ELBOW) - _pattern(robot, "right", _ELBOW)
-    return pose + share * (config.arm_swing * c * arms + config.elbow_bend * elbows)
+    sweep = c * (config.arm_swing * arms - config.stride_sweep * hips)
+    return pose + share * (sweep + config.elbow_bend * elbows)
 
 
 def _pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:

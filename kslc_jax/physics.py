@@ -72,9 +72,9 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
     """PD torque within the motor's limits, minus joint friction [16, N m].
 
     clip(kp (target - q) - kd dq, lower, upper): in the driving direction the available torque
-    falls from its full value (0.85 x effort limit x strength) at 75 % of the joint's speed limit to
-    zero at the limit; braking keeps all of it. PhysX, which Humanoid-Gym trains in, clamps the
-    joint speed itself.
+    falls on a line from its full value (0.85 x effort limit x strength) at 75 % of the joint's
+    speed limit to zero at the limit, and on from there: a motor that is turned faster than it can
+    turn by itself brakes. Braking keeps all of the torque.
 
     Args:
       robot: gains and limits.
@@ -85,9 +85,21 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
     pd = dynamics.kp * robot.kp * (target - q) - dynamics.kd * robot.kd * dq
     full = robot.effort_limit * dynamics.motor_strength
     fall = (1.0 - TORQUE_KNEE) * robot.speed_limit
-    upper = full * xp.clip((robot.speed_limit - dq) / fall, 0.0, 1.0)
-    lower = -full * xp.clip((robot.speed_limit + dq) / fall, 0.0, 1.0)
+    upper = full * xp.clip((robot.speed_limit - dq) / fall, -1.0, 1.0)
+    lower = -full * xp.clip((robot.speed_limit + dq) / fall, -1.0, 1.0)
     return xp.clip(pd, lower, upper) - dynamics.joint_friction * xp.tanh(dq / FRICTION_SPEED)
+
+
+def limit_speed(config: PhysicsConfig, robot: Robot, qvel, xp: Any = jnp):
+    """qvel [..., 22] with joint speeds cut at their limits, as PhysX does, where the config wants it.
+
+    The motors' law alone cannot hold a light shank at 5 ms: one step of full torque carries it from
+    9 to 16 of its 12 rad/s, and one of braking back to 5.
+    """
+    if not config.clamp_joint_speed:
+        return qvel
+    joints = xp.clip(qvel[..., 6:], -robot.speed_limit, robot.speed_limit)
+    return xp.concatenate([qvel[..., :6], joints], axis=-1)
 
 
 def servo_control(robot: Robot, torque, q, dq):
@@ -159,6 +171,7 @@ def _step_mjx(
     )
 
     def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
+        data = data.replace(qvel=limit_speed(config, robot, data.qvel))
         q, dq = data.qpos[7:], data.qvel[6:]
         torque = motor_torque(robot, dynamics, q, dq, target)
         data = data.replace(ctrl=servo_control(robot, torque, q, dq))
@@ -169,7 +182,7 @@ def _step_mjx(
         data = _refresh_sensors(model, data)
     return PhysicsState(
         qpos=data.qpos,
-        qvel=data.qvel,
+        qvel=limit_speed(config, robot, data.qvel),
         qacc_warmstart=data.qacc_warmstart,
         sensordata=data.sensordata,
         torque=torques[-1],
@@ -247,12 +260,17 @@ def _host_step(
         qpos[:], qvel[:], warmstart[:] = state.qpos, state.qvel, state.qacc_warmstart
         torque = state.torque
         for i in range(config.decimation):
+            qvel[:] = limit_speed(config, robot, qvel, np)
             q, dq = qpos[:, 7:], qvel[:, 6:]
             torque = motor_torque(robot, dynamics, q, dq, target, np)
             ctrl[:] = servo_control(robot, torque, q, dq)
             last = i == config.decimation - 1
             batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
         new = state.replace(
-            qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, sensordata=sensordata, torque=torque
+            qpos=qpos,
+            qvel=limit_speed(config, robot, qvel, np),
+            qacc_warmstart=warmstart,
+            sensordata=sensordata,
+            torque=torque,
         )
         return jax.tree.map(lambda x: np.array(x, np.float32).reshape(*lead, *x.shape[1:]), new)

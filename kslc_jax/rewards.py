@@ -73,7 +73,8 @@ def feet_clearance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
         return jnp.sum(near & swing).astype(jnp.float32)
     gain = cfg.clearance_speed_gain * speed_share(x.command, x.v_max)
     error = jnp.abs(x.gait.swing_height - cfg.clearance_target * (1.0 + gain))
-    return jnp.sum(jnp.exp(-error / cfg.clearance_width) * swing)
+    mid_swing = 2.0 * jnp.square(x.gait.clock[0]) if cfg.clearance_mid_swing else 1.0
+    return jnp.sum(jnp.exp(-error / cfg.clearance_width) * swing * mid_swing)
 
 
 def joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:

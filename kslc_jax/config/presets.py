@@ -57,8 +57,9 @@ _LAPTOP = _override(
         "stand_still": True,
     },
     gait={
-        "double_support_at_speed": -0.3,
+        "double_support_at_speed": -0.4,
         "reference_speed_gain": 1.0,
+        "stride_sweep": 0.35,
         "arm_swing": 0.5,
         "elbow_bend": 1.0,
         "cycle_follows_speed": True,
@@ -76,6 +77,7 @@ _LAPTOP = _override(
     rewards={
         "base_height_kernel": 30.0,
         "clearance_width": 0.03,
+        "clearance_mid_swing": True,
         "max_contact_force": 1400.0,
         "lateral_distance": True,
         "lean_per_speed": 0.03,
@@ -86,7 +88,7 @@ _LAPTOP = _override(
             "track_vel_hard": 0.8,
             "tracking_mean_vel": 1.0,
             "dof_acc": -3e-7,
-            "dof_vel_limits": -3.0,
+            "dof_vel_limits": -6.0,
             "stand_still": -0.3,
         },
     },

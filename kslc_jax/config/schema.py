@@ -57,6 +57,8 @@ class PhysicsConfig:
     """Newton iterations of the contact solver; below 4 contact explodes on this robot."""
     ls_iterations: int = 5
     """Line-search iterations of the contact solver."""
+    clamp_joint_speed: bool = True
+    """Cuts joint speeds at their limits at every physics step, as PhysX does (HG's engine)."""
     threads: int = 0
     """CPU threads of the mujoco engine; 0 takes all cores. Does not change results."""
 
@@ -84,6 +86,8 @@ class HighFidelity(PhysicsConfig):
     decimation: int = 10
     iterations: int = 100
     ls_iterations: int = 50
+    clamp_joint_speed: bool = False
+    """At 1 ms the motors' own law holds joints to their limits."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -174,6 +178,9 @@ class GaitConfig:
     """Relative growth of the leg reference at `full_speed` (paper, Eq. 8: longer strides)."""
     full_speed: float = 3.5
     """Commanded speed [m/s] at which speed-dependent references are fully grown."""
+    stride_sweep: float = 0.0
+    """Hip reference amplitude [rad] at `full_speed`: the leg lands in front of the body and leaves
+    the ground behind it."""
     arm_swing: float = 0.0
     """Shoulder reference amplitude [rad] at `full_speed`, against the same side's leg."""
     elbow_bend: float = 0.0
@@ -295,6 +302,9 @@ class RewardConfig:
     """Relative growth of the clearance target at the fastest command (Eq. 7)."""
     clearance_width: float = 0.01
     """Half width of HG's window, or length scale of Eq. 7's kernel as read [m]."""
+    clearance_mid_swing: bool = False
+    """Weighs the swing foot's height with sin^2 of the gait phase (mean over a half cycle: 1), so
+    that it counts in mid-swing and not while the foot leaves the ground or comes down."""
     joint_pos_kernel: float = 2.0
     """-beta^p of Eq. 8."""
     joint_pos_penalty: float = 0.2

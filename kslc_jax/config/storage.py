@@ -9,17 +9,20 @@ from kslc_jax.config.schema import Config, require
 
 SCHEMA_VERSION = 1
 
-YOUNGER = {
-    "config.network.init_mean",
-    "config.gait.double_support_at_speed",
-    "config.rewards.weights.tracking_mean_vel",
-    "config.curriculum.gait_threshold",
-    "config.randomize.noise",
-    "config.rewards.exact_from",
-    "config.rewards.exact_full",
-    "config.run.snapshots",
+YOUNGER: dict[str, Any] = {
+    "config.physics.clamp_joint_speed": False,
+    "config.network.init_mean": 1.0,
+    "config.gait.double_support_at_speed": 0.1,
+    "config.gait.stride_sweep": 0.0,
+    "config.rewards.weights.tracking_mean_vel": 0.0,
+    "config.rewards.clearance_mid_swing": False,
+    "config.rewards.exact_from": 0.5,
+    "config.rewards.exact_full": 2.5,
+    "config.curriculum.gait_threshold": -1.0,
+    "config.randomize.noise": (1.0, 1.0),
+    "config.run.snapshots": 24,
 }
-"""Fields that older files of this version lack; their defaults give the numbers of before."""
+"""Fields that older files of this version lack, with the values that give the numbers of then."""
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -45,9 +48,11 @@ def _build(cls: Any, data: Any, where: str) -> Any:
     hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
     unknown = set(data) - set(hints)
     require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
-    missing = sorted(n for n in set(hints) - set(data) if f"{where}.{n}" not in YOUNGER)
+    absent = set(hints) - set(data)
+    older = {n: YOUNGER[f"{where}.{n}"] for n in absent if f"{where}.{n}" in YOUNGER}
+    missing = sorted(absent - set(older))
     require(not missing, f"{where}: missing field {', '.join(missing)}")
-    return cls(**{name: _value(hints[name], data[name], f"{where}.{name}") for name in data})
+    return cls(**older, **{n: _value(hints[n], data[n], f"{where}.{n}") for n in data})
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
