@@ -30,6 +30,7 @@ import orbax.checkpoint as ocp
 from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import networks, observations
+from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.train_step import TrainState
@@ -39,8 +40,12 @@ SNAPSHOTS = "snapshots"
 POLICIES = Path(__file__).parent / "policies"
 BEST_METRIC = "score"
 
-SCHEMA_VERSION = 1
-"""Of a checkpoint's items; raise it when an older kslc_jax could not read what this one writes."""
+SCHEMA_VERSION = 2
+"""Of a checkpoint's items; raise it with every change of the tree of `TrainState`, and say below
+what the older ones lack."""
+
+OLDER_POLICIES = (1,)
+"""Schemas of which only the policy is still read. 1: no ceiling of the learning rate."""
 
 
 class CheckpointError(RuntimeError):
@@ -66,22 +71,42 @@ def checksum(tree: Any) -> int:
     return crc
 
 
-def _checked_meta(meta: Any) -> dict[str, Any]:
-    """The meta item, if it is of this schema and as it was written; CheckpointError if not."""
+def _checked_meta(meta: Any, whole: bool) -> dict[str, Any]:
+    """The meta item, if it is as it was written, of this robot and of a schema that is read, for
+    going on with the `whole` training or for the policy alone; CheckpointError if not."""
     schema = meta.get("schema", 1)
-    if schema != SCHEMA_VERSION:
+    if schema in OLDER_POLICIES and whole:
+        raise CheckpointError(
+            f"it has checkpoint schema {schema}, this kslc_jax goes on from {SCHEMA_VERSION}: use "
+            "the version that wrote it (versions.json), or begin a new training with --start-from"
+        )
+    if schema not in (*OLDER_POLICIES, SCHEMA_VERSION):
         raise CheckpointError(
             f"it has checkpoint schema {schema}, this kslc_jax reads {SCHEMA_VERSION}: "
             "use the version that wrote it, see versions.json"
         )
     _compare(meta.get("checksums", {}), "meta", zlib.crc32(_text(meta)))
+    ours = _robot()
+    theirs = meta.get("robot", ours)  # the first schema had none
+    if theirs != ours:
+        raise CheckpointError(f"it is of another robot, {theirs!r:.80}, not of {ours['name']}")
     return meta
+
+
+def _robot() -> dict[str, Any]:
+    """What a policy's actions mean: the robot's name and the order of its joints."""
+    robot = robot_lib.load()
+    return {"name": robot.name, "joints": list(robot.joint_names)}
 
 
 def _meta(config: Config, metrics: dict[str, float], parts: dict[str, Any]) -> dict[str, Any]:
     """The meta item that goes with the other items of a checkpoint."""
-    config_dict = config_lib.to_dict(config)
-    meta = {"schema": SCHEMA_VERSION, "config": config_dict, "metrics": metrics}
+    meta = {
+        "schema": SCHEMA_VERSION,
+        "robot": _robot(),
+        "config": config_lib.to_dict(config),
+        "metrics": metrics,
+    }
     sums = {name: checksum(part) for name, part in parts.items()}
     return {**meta, "checksums": {**sums, "meta": zlib.crc32(_text(meta))}}
 
@@ -103,6 +128,7 @@ def _split(state: TrainState) -> dict[str, Any]:
         "core": {
             "opt_state": state.learner.opt_state,
             "learning_rate": state.learner.learning_rate,
+            "rate_ceiling": state.learner.rate_ceiling,
             "curriculum": state.curriculum,
             "key": state.key,
             "step": state.step,
@@ -117,6 +143,7 @@ def _join(parts: dict[str, Any], like: TrainState) -> TrainState:
         params=parts["params"],
         opt_state=core["opt_state"],
         learning_rate=core["learning_rate"],
+        rate_ceiling=core["rate_ceiling"],
     )
     return TrainState(learner, parts["env"], core["curriculum"], core["key"], core["step"])
 
@@ -226,9 +253,10 @@ class Store:
     def _restore(self, step: int, like: TrainState) -> TrainState:
         parts = _split(like)
         items = {name: ocp.args.StandardRestore(_abstract(part)) for name, part in parts.items()}
-        composite = ocp.args.Composite(**items, meta=ocp.args.JsonRestore())
-        restored = self._manager.restore(step, args=composite)
-        sums = _checked_meta(restored["meta"]).get("checksums", {})
+        only_meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
+        meta = _checked_meta(self._manager.restore(step, args=only_meta)["meta"], whole=True)
+        restored = self._manager.restore(step, args=ocp.args.Composite(**items))
+        sums = meta.get("checksums", {})
         for name in items:
             _compare(sums, name, checksum(restored[name]))
         return _join({name: restored[name] for name in items}, like)
@@ -282,7 +310,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
         try:
             meta = reader.restore(folder, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
-            meta = _checked_meta(meta["meta"])
+            meta = _checked_meta(meta["meta"], whole=False)
             config = config_lib.from_dict(meta["config"])
             reached = meta["metrics"]
             step = int(reached.get("step", folder.name if folder.name.isdigit() else 0))

@@ -19,6 +19,7 @@ class Learner:
     params: Params
     opt_state: optax.OptState
     learning_rate: jax.Array  # []
+    rate_ceiling: jax.Array  # [] what the learning rate may reach; lowered after bad numbers
 
 
 @flax.struct.dataclass
@@ -35,6 +36,9 @@ class Samples:
     valid: jax.Array  # [] bool, False: not to be learnt from
 
 
+RELIEF = 1.02
+"""Factor on the ceiling of the learning rate per update: a halved one is whole after 36."""
+
 Apply = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array]]
 """(params, indices [B]) -> (action distribution, values [B]) at those observations."""
 
@@ -47,7 +51,8 @@ def optimizer(config: PPOConfig) -> optax.GradientTransformation:
 def init(config: PPOConfig, params: Params) -> Learner:
     """Learner before the first update."""
     rate = jnp.asarray(config.learning_rate, jnp.float32)
-    return Learner(params, optimizer(config).init(params), rate)
+    ceiling = jnp.asarray(config.learning_rate_bounds[1], jnp.float32)
+    return Learner(params, optimizer(config).init(params), rate, ceiling)
 
 
 def gae(
@@ -123,12 +128,15 @@ def loss(
     return total, info
 
 
-def adapt_learning_rate(config: PPOConfig, rate: jax.Array, kl: jax.Array) -> jax.Array:
-    """Lowers the rate where KL > 2 desired, raises it where KL < desired / 2, within bounds."""
+def adapt_learning_rate(
+    config: PPOConfig, rate: jax.Array, kl: jax.Array, ceiling: jax.Array | float = jnp.inf
+) -> jax.Array:
+    """Lowers the rate where KL > 2 desired, raises it where KL < desired / 2, up to the ceiling and
+    within bounds."""
     rate = jnp.where(kl > 2.0 * config.desired_kl, rate / config.learning_rate_factor, rate)
     slow = (kl > 0.0) & (kl < 0.5 * config.desired_kl)
     rate = jnp.where(slow, rate * config.learning_rate_factor, rate)
-    return jnp.clip(rate, *config.learning_rate_bounds)
+    return jnp.clip(jnp.minimum(rate, ceiling), *config.learning_rate_bounds)
 
 
 def gradient_step(
@@ -139,11 +147,12 @@ def gradient_step(
         config, apply, log_std, learner.params, batch
     )
     grad_norm = optax.tree.norm(grads)
-    rate = adapt_learning_rate(config, learner.learning_rate, info["kl"])
+    ceiling = learner.rate_ceiling
+    rate = adapt_learning_rate(config, learner.learning_rate, info["kl"], ceiling)
     updates, opt_state = optimizer(config).update(grads, learner.opt_state)
     params = jax.tree.map(lambda p, u: p - rate * u, learner.params, updates)
     finite = jnp.isfinite(grad_norm)
-    new = Learner(params, opt_state, rate)
+    new = Learner(params, opt_state, rate, ceiling)
     learner = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, learner)
     return learner, {**info, "grad_norm": grad_norm, "skipped": 1.0 - finite}
 
@@ -160,6 +169,8 @@ def update(
 
     `log_std` [16] is the deviation that the samples were drawn with.
     """
+    ceiling = jnp.minimum(RELIEF * learner.rate_ceiling, config.learning_rate_bounds[1])
+    learner = learner.replace(rate_ceiling=ceiling)
     samples = samples.replace(advantage=_normalise(samples.advantage, samples.valid))
     size = samples.index.shape[0]
 

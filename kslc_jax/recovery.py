@@ -126,10 +126,12 @@ def _leave(config: Config, path: Path, state: TrainState) -> str:
 
 
 def cautious(state: TrainState, attempt: int) -> TrainState:
-    """`state` with a lower learning rate and, so that not all comes again, other random draws."""
+    """`state` with a lower learning rate, which may not rise at once, and, so that not all comes
+    again, other random draws."""
     rate = state.learner.learning_rate * CAUTION**attempt
-    key = jax.random.fold_in(state.key, attempt)
-    return state.replace(learner=state.learner.replace(learning_rate=rate), key=key)
+    # A copy: a train step donates its state, which may not hold one buffer twice.
+    learner = state.learner.replace(learning_rate=rate, rate_ceiling=jnp.copy(rate))
+    return state.replace(learner=learner, key=jax.random.fold_in(state.key, attempt))
 
 
 def dump(path: Path, config: Config, state: TrainState) -> None:

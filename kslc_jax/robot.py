@@ -26,6 +26,7 @@ class Robot:
     """Static facts of the robot, read back from the compiled model. [16] is in action order."""
 
     mj_model: mujoco.MjModel
+    name: str
     joint_names: tuple[str, ...]  # 16
     kp: np.ndarray  # [16] N m/rad
     kd: np.ndarray  # [16] N m s/rad
@@ -93,6 +94,7 @@ def load(
     box = model.site("torso_box")
     return Robot(
         mj_model=model,
+        name=spec.modelname,
         joint_names=names,
         kp=model.actuator_gainprm[:, 0].copy(),
         kd=-model.actuator_biasprm[:, 2],

@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import dataclasses
 import json
 import os
 import pickle
@@ -18,7 +19,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, doctor, physics, recovery, runner, runtime, train, train_step
+from kslc_jax import (
+    checkpoint,
+    doctor,
+    physics,
+    ppo,
+    recovery,
+    runner,
+    runtime,
+    train,
+    train_step,
+)
 from kslc_jax.checkpoint import CheckpointError, Store
 from kslc_jax.config import preset, to_dict
 from kslc_jax.logs import MetricsFile
@@ -38,6 +49,19 @@ METRICS = dict.fromkeys(
 def made():
     """Debug preset: initial state maker and compiled train step."""
     init, step = train_step.make(DEBUG)
+    return init, step.lower(init()).compile()
+
+
+@pytest.fixture(
+    scope="module",
+    params=["mujoco", pytest.param("mjx", marks=pytest.mark.slow(reason="compiles MJX"))],
+)
+def either(request, made):
+    """The same with each engine."""
+    if request.param == "mujoco":
+        return made
+    physics_config = dataclasses.replace(DEBUG.physics, engine=request.param)
+    init, step = train_step.make(dataclasses.replace(DEBUG, physics=physics_config))
     return init, step.lower(init()).compile()
 
 
@@ -96,8 +120,8 @@ SEEN_LATER = {"last_last_action": 2, "physics.qvel": 1}  # samples lost to an ov
 class TestEnvironments:
     """One sample is lost, nothing else: not the update, not the curriculum, not the neighbours."""
 
-    def assert_contained(self, made, where, value, rows, lost):
-        init, step = made
+    def assert_contained(self, either, where, value, rows, lost):
+        init, step = either
         healthy, _ = step(init())
         new, metrics = step(put(init(), f"env.{where}", value, rows))
         assert all(np.isfinite(x).all() for x in numbers(new) if x.dtype.kind == "f")
@@ -110,17 +134,17 @@ class TestEnvironments:
 
     @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
     @pytest.mark.parametrize("where", SEEN_AT_ONCE)
-    def test_one(self, made, where, value):
-        self.assert_contained(made, where, value, slice(3, 4), lost=1)
+    def test_one(self, either, where, value):
+        self.assert_contained(either, where, value, slice(3, 4), lost=1)
 
     @pytest.mark.parametrize("where", SEEN_AT_ONCE)
-    def test_all(self, made, where):
-        self.assert_contained(made, where, jnp.nan, slice(None), lost=DEBUG.env.num_envs)
+    def test_all(self, either, where):
+        self.assert_contained(either, where, jnp.nan, slice(None), lost=DEBUG.env.num_envs)
 
     @pytest.mark.parametrize(("where", "lost"), SEEN_LATER.items())
-    def test_overflow_in_mid_rollout(self, made, where, lost):
+    def test_overflow_in_mid_rollout(self, either, where, lost):
         """Finite at the start, so that the step itself makes the bad number."""
-        self.assert_contained(made, where, 1e30, slice(3, 4), lost)
+        self.assert_contained(either, where, 1e30, slice(3, 4), lost)
 
 
 class TestLearner:
@@ -136,13 +160,13 @@ class TestLearner:
             "curriculum.v_max",
         ],
     )
-    def test_not_finite(self, made, where):
-        init, step = made
+    def test_not_finite(self, either, where):
+        init, step = either
         _, metrics = step(put(init(), where, jnp.nan, ...))
         assert metrics["finite"] == 0
 
-    def test_optimiser(self, made):
-        init, step = made
+    def test_optimiser(self, either):
+        init, step = either
         state = init()
         bad = jax.tree.map(
             lambda x: x * jnp.nan if jnp.issubdtype(x.dtype, jnp.floating) else x,
@@ -151,9 +175,9 @@ class TestLearner:
         _, metrics = step(state.replace(learner=state.learner.replace(opt_state=bad)))
         assert metrics["finite"] == 0
 
-    def test_gradient(self, made):
+    def test_gradient(self, either):
         """A critic so large that its loss overflows: every update is skipped, nothing changes."""
-        init, step = made
+        init, step = either
         state = put(init(), "learner.params.critic.Dense_0.kernel", 1e30, ...)
         before = jax.tree.map(jnp.copy, state.learner)
         new, metrics = step(state)
@@ -252,7 +276,18 @@ class TestGoingBack:
         state = state_at(3)
         new = recovery.cautious(state, 2)
         assert new.learner.learning_rate == pytest.approx(0.25 * state.learner.learning_rate)
+        assert new.learner.rate_ceiling == new.learner.learning_rate
         assert new.key != state.key and same(new.learner.params, state.learner.params)
+
+    def test_caution_lasts(self, made):
+        """The KL rule raises the lowered learning rate by 2 % a train step at most."""
+        init, step = made
+        state = recovery.cautious(init(), 1)
+        low = float(state.learner.learning_rate)
+        assert low == pytest.approx(0.5 * DEBUG.ppo.learning_rate)
+        for i in range(1, 4):
+            state, metrics = step(state)
+            assert float(metrics["ppo/learning_rate"]) <= low * ppo.RELIEF**i * 1.00001
 
     def test_replay_shows_where(self, made, tmp_path, capsys, monkeypatch):
         """A number that overflows in the first control step, in one environment."""
@@ -451,18 +486,42 @@ def edit_meta(run_dir, change):
 
 
 class TestSchema:
-    def test_older_without_checksums_loads(self, saved, restored, tmp_path):
-        def strip(meta):
-            del meta["checksums"], meta["schema"]
+    OLD = ROOT / "tests" / "data" / "checkpoint-schema-1"
+    """Two environments, two hidden units, one train step."""
 
-        edit_meta(saved(tmp_path, 1), strip)
+    def test_policy_of_schema_1(self):
+        policy = checkpoint.load_policy(self.OLD)
+        assert policy.step == 1 and not policy.config.physics.clamp_joint_speed
+        action = policy.act_on(jnp.full((1, 59), 0.5))
+        written = [0.00246058, 0.00342976, -0.00067609, 0.00228753]
+        np.testing.assert_allclose(action[:4], written, rtol=1e-4)
+
+    def test_training_of_schema_1_says_why_not(self, tmp_path, capsys):
+        run = shutil.copytree(self.OLD, tmp_path / "run")
+        assert train.main(["--resume", "--run-dir", str(run)]) == 2
+        line = the_error(capsys)
+        assert "checkpoint schema 1, this kslc_jax goes on from 2" in line
+        assert "--start-from" in line
+        assert [p.name for p in (run / "checkpoints").iterdir()] == ["1"]
+
+    def test_tree_of_this_schema(self, like):
+        """Another tree needs another SCHEMA_VERSION, or old checkpoints fail in orbax's words."""
+        stored = ROOT / "tests" / "data" / f"train_state_schema_{checkpoint.SCHEMA_VERSION}.txt"
+        leaves = [
+            f"{jax.tree_util.keystr(where)} {x.dtype} {x.ndim}"
+            for where, x in jax.tree.leaves_with_path(like)
+        ]
+        assert leaves == stored.read_text().splitlines()
+
+    def test_without_checksums_loads(self, saved, restored, tmp_path):
+        edit_meta(saved(tmp_path, 1), lambda meta: meta.pop("checksums"))
         assert restored(tmp_path) == (1, [])
         assert checkpoint.load_policy(tmp_path).step == 1
 
     def test_newer_says_why_not(self, saved, restored, tmp_path):
-        edit_meta(saved(tmp_path, 1), lambda meta: meta.update(schema=2))
+        edit_meta(saved(tmp_path, 1), lambda meta: meta.update(schema=99))
         for load in (checkpoint.load_policy, restored):
-            with pytest.raises(CheckpointError, match="checkpoint schema 2, this kslc_jax reads 1"):
+            with pytest.raises(CheckpointError, match="checkpoint schema 99, this kslc_jax reads"):
                 load(tmp_path)
 
     def test_newer_config_says_why_not(self, saved, restored, tmp_path):
@@ -473,6 +532,16 @@ class TestSchema:
         edit_meta(saved(tmp_path, 1), newer)
         with pytest.raises(CheckpointError, match="schema version 99"):
             checkpoint.load_policy(tmp_path)
+
+    def test_another_robot(self, saved, restored, tmp_path):
+        def other(meta):
+            meta["robot"]["name"] = "XBot-S"
+            del meta["checksums"]
+
+        edit_meta(saved(tmp_path, 1), other)
+        for load in (checkpoint.load_policy, restored):
+            with pytest.raises(CheckpointError, match="another robot, {'name': 'XBot-S'.*XBot-L"):
+                load(tmp_path)
 
 
 class Bomb:
@@ -619,45 +688,47 @@ class TestDoctor:
 # ------------------------------------------------------------------------------------ determinism
 
 
-def five_steps(init, step):
+def twenty_steps(init, step):
     state, rows = init(), []
-    for _ in range(5):
+    for _ in range(20):
         state, metrics = step(state)
         rows.append({name: float(value).hex() for name, value in metrics.items()})
-    return rows
+    return rows, checkpoint.checksum(state)
 
 
 class TestDeterminism:
     def test_two_inits_and_any_number_of_threads(self, made, monkeypatch):
-        """Bit-identical metrics; the step is compiled once, the simulator's threads are changed
+        """Bit-identical metrics and state; the step is compiled once, the simulator's threads are changed
         under it."""
         init, step = made
-        rows, real = [five_steps(init, step)], physics._batch
+        rows, real = [twenty_steps(init, step)], physics._batch
         for threads in (1, 2):
             monkeypatch.setattr(
                 physics,
                 "_batch",
                 lambda robot, size, _, fields, n=threads: real(robot, size, n, fields),
             )
-            rows.append(five_steps(init, step))
+            rows.append(twenty_steps(init, step))
             assert any(key[2] == threads for key in physics._batches)
         assert rows[0] == rows[1] == rows[2]
 
     @pytest.mark.slow(reason="compiles a train step with each engine, twice")
     @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
-    def test_two_processes(self, engine, tmp_path):
+    def test_two_processes(self, engine, like, tmp_path):
         """Two processes with one seed; with the mujoco engine on one thread and on two."""
-        rows = []
+        rows, sums = [], []
         for i in (1, 2):
-            args = ["--preset", "debug", "--steps", 5 * 128, "--run-dir", tmp_path / str(i)]
+            args = ["--preset", "debug", "--steps", 20 * 128, "--run-dir", tmp_path / str(i)]
             args += ["--physics.engine", engine, "--physics.threads", i]
             command = [sys.executable, "-m", "kslc_jax.train", *map(str, args)]
             subprocess.run(command, check=True, capture_output=True)
             text = (tmp_path / str(i) / "metrics.jsonl").read_text()
             rows.append([json.loads(line) for line in text.splitlines()])
+            with contextlib.closing(Store(tmp_path / str(i))) as store:
+                sums.append(checkpoint.checksum(store.restore(like, pytest.fail)))
         wall_clock = ("seconds", "steps_per_second")
         a, b = ([{k: v for k, v in r.items() if k not in wall_clock} for r in x] for x in rows)
-        assert len(a) == 5 and a == b
+        assert len(a) == 20 and a == b and sums[0] == sums[1]
 
 
 # ------------------------------------------------------------------------------------------ kills

@@ -100,6 +100,14 @@ def test_learning_rate_stays_in_bounds():
     )
 
 
+def test_learning_rate_stays_below_its_ceiling():
+    """But not below the lower bound, and the ceiling itself not above the upper one."""
+    low, high = CONFIG.learning_rate_bounds
+    slow = jnp.asarray(1e-9)
+    assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(high), slow, 1e-4) == pytest.approx(1e-4)
+    assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(high), slow, 0.1 * low) == pytest.approx(low)
+
+
 def samples(**changes):
     base = ppo.Samples(
         index=jnp.arange(2),
