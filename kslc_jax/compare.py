@@ -21,6 +21,7 @@ from pathlib import Path
 import tyro
 
 from kslc_jax import config as config_lib
+from kslc_jax import evaluate
 from kslc_jax.config import ConfigError
 from kslc_jax.plots import EVALUATION
 
@@ -56,6 +57,13 @@ class Args:
             raise ConfigError(f"variants: unknown {unknown[0]!r} (known: {', '.join(VARIANTS)})")
         for name in (self.preset, self.baseline):
             config_lib.preset(name)
+        for name in ("steps", "trials"):
+            if getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be at least 1")
+        for name in ("seeds", "ablation_seeds"):
+            if any(not 0 <= seed < config_lib.COUNTER for seed in getattr(self, name)):
+                raise ConfigError(f"{name} must not be negative, nor above 2^31")
+        evaluate.check(self.speeds, self.trials, 1.0)
 
 
 @dataclass(frozen=True)

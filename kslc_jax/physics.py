@@ -91,7 +91,7 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
 
 
 def limit_speed(config: PhysicsConfig, robot: Robot, qvel, xp: Any = jnp):
-    """qvel [..., 22] with joint speeds cut at their limits, as PhysX does, where the config wants it.
+    """qvel [..., 22] with joint speeds cut at their limits as PhysX does, if the config wants it.
 
     The motors' law alone cannot hold a light shank at 5 ms: one step of full torque carries it from
     9 to 16 of its 12 rad/s, and one of braking back to 5.

@@ -18,6 +18,7 @@ from typing import Any
 
 import tyro
 
+from kslc_jax import config as config_lib
 from kslc_jax import evaluate, runtime
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.plots import EVALUATION
@@ -56,6 +57,10 @@ class Args:
     """Of the training."""
     run_dir: Path = Path("runs/reproduce")
     """Where the training goes."""
+
+    def __post_init__(self):
+        if not 0 <= self.seed < config_lib.COUNTER:
+            raise ConfigError("seed must not be negative, nor above 2^31")
 
 
 def stored(folder: Path, name: str) -> dict[str, Any]:
@@ -150,11 +155,11 @@ def repeat(args: Args) -> list[Row]:
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    args = tyro.cli(Args, args=argv, description=__doc__)
     from kslc_jax.checkpoint import CheckpointError
     from kslc_jax.runner import RunError
 
     try:
+        args = tyro.cli(Args, args=argv, description=__doc__)
         rows = repeat(args)
     except (CheckpointError, ConfigError, RunError) as error:
         print(f"error: {error}", file=sys.stderr)

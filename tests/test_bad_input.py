@@ -17,7 +17,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from kslc_jax import checkpoint, doctor, evaluate, play, plots, sim2sim, train, train_step
+from kslc_jax import (
+    checkpoint,
+    compare,
+    doctor,
+    evaluate,
+    export,
+    learning,
+    play,
+    plots,
+    reproduce,
+    sim2sim,
+    train,
+    train_step,
+)
 from kslc_jax.config import PRESETS, preset, to_dict
 
 few = settings(
@@ -227,6 +240,69 @@ class TestPolicyCommands:
         (tmp_path / "params").mkdir()
         (tmp_path / "params" / "x").write_bytes(b"\x80\x04junk")
         assert str(tmp_path) in refused(main, tmp_path, *more)
+
+
+class TestExport:
+    @few
+    @given(word=words)
+    def test_suffix(self, policy, run_dir, word):
+        assert word in refused(export.main, policy, run_dir / f"policy.{word}")
+        assert list(run_dir.iterdir()) == []
+
+    def test_nothing_there(self, run_dir):
+        assert "nicht da" in refused(export.main, "nicht da", run_dir / "policy.onnx")
+
+    def test_nowhere_to_write(self, policy, run_dir):
+        (run_dir / "file").touch()
+        out = run_dir / "file" / "policy.onnx"
+        assert str(out) in refused(export.main, policy, out)
+
+
+class TestCompare:
+    @few
+    @given(words, st.sampled_from(["variants", "preset", "baseline", "seeds", "speeds", "steps"]))
+    def test_words(self, run_dir, word, name):
+        said = refused(compare.main, "--out", run_dir / "new", f"--{name}", word)
+        assert word in said and not (run_dir / "new").exists()
+
+    @few
+    @given(st.integers(-(2**40), 0), st.sampled_from(["steps", "trials"]))
+    def test_no_positive_count(self, run_dir, value, name):
+        assert name in refused(compare.main, "--out", run_dir / "new", f"--{name}", value)
+
+    @pytest.mark.parametrize("name", ["seeds", "ablation-seeds"])
+    def test_seeds(self, run_dir, name):
+        for seed in (-1, 2**31):
+            said = refused(compare.main, "--out", run_dir / "new", f"--{name}", 0, seed)
+            assert name.replace("-", "_") in said
+
+
+class TestLearning:
+    def test_no_run(self, run_dir):
+        assert "name at least one run" in refused(learning.main)
+        assert "holds no snapshots" in refused(learning.main, run_dir)
+
+    def test_damaged_snapshot(self, run_dir):
+        (run_dir / "snapshots" / "7" / "params").mkdir(parents=True)
+        assert str(run_dir / "snapshots" / "7") in refused(learning.main, run_dir)
+
+    @pytest.mark.parametrize("option", ["--seconds=nan", "--seeds=0", "--speeds=fast"])
+    def test_options(self, run_dir, option):
+        assert option[2:].split("=")[0] in refused(learning.main, run_dir, option)
+
+
+class TestReproduce:
+    @few
+    @given(words)
+    def test_unknown_policy(self, word):
+        assert word in refused(reproduce.main, word)
+
+    @pytest.mark.parametrize("seed", [-1, 2**31, "one"])
+    def test_seed(self, seed):
+        assert "seed" in refused(reproduce.main, "--seed", seed)
+
+    def test_not_a_shipped_one(self, policy):
+        assert "evaluation.json" in refused(reproduce.main, policy)
 
 
 class TestPlots:

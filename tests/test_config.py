@@ -185,7 +185,8 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "command.forward_fraction": 0.2,
         "command.narrow_speed": 4.0,
         "command.stand_still": True,
-        "gait.double_support_at_speed": -0.3,
+        "gait.double_support_at_speed": -0.4,
+        "gait.stride_sweep": 0.35,
         "gait.reference_speed_gain": 1.0,
         "gait.arm_swing": 0.5,
         "gait.elbow_bend": 1.0,
@@ -202,6 +203,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "randomize.noise": (0.0, 1.0),
         "rewards.base_height_kernel": 30.0,
         "rewards.clearance_width": 0.03,
+        "rewards.clearance_mid_swing": True,
         "rewards.max_contact_force": 1400.0,
         "rewards.lateral_distance": True,
         "rewards.lean_per_speed": 0.03,
@@ -211,7 +213,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.weights.track_vel_hard": 0.8,
         "rewards.weights.tracking_mean_vel": 1.0,
         "rewards.weights.dof_acc": -3e-7,
-        "rewards.weights.dof_vel_limits": -3.0,
+        "rewards.weights.dof_vel_limits": -6.0,
         "rewards.weights.stand_still": -0.3,
     }
     assert LAPTOP.minibatch_size == 12_288

@@ -16,6 +16,7 @@ from kslc_jax.config import GaitConfig, preset
 DT = 0.01
 PAPER = preset("paper").gait
 GROWING = dataclasses.replace(PAPER, reference_speed_gain=1.0, arm_swing=0.5, elbow_bend=1.0)
+SWEEPING = dataclasses.replace(GROWING, stride_sweep=0.35)
 KEY = jax.random.key(0)
 
 
@@ -210,16 +211,28 @@ def test_arm_reference(phase, vx, swing, bend):
     np.testing.assert_allclose(pose(phase, vx, GROWING)[12:], expected[12:], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("phase", "vx", "sweep"),
+    [(0.0, 3.5, 0.4), (0.5, 3.5, -0.4), (0.25, 3.5, 0.0), (0.0, 1.75, 0.2)],
+)
+def test_hips_sweep(phase, vx, sweep):
+    """cos = 1 at the left foot's touchdown: left leg in front (negative), right leg behind, whose
+    axis is mirrored (negative as well)."""
+    config = dataclasses.replace(PAPER, stride_sweep=0.4)
+    expected = pose(phase, vx) + joints(left_leg_pitch=-sweep, right_leg_pitch=-sweep)
+    np.testing.assert_allclose(pose(phase, vx, config), expected, atol=1e-6)
+
+
 def test_reference_pose_of_standing_still_is_zero():
     for phase in (0.25, 0.75):
-        np.testing.assert_array_equal(pose(phase, 0.0, GROWING, moving=False), np.zeros(16))
+        np.testing.assert_array_equal(pose(phase, 0.0, SWEEPING, moving=False), np.zeros(16))
 
 
 @pytest.mark.parametrize("phase", [0.05, 0.2, 0.3, 0.45])
 def test_half_a_cycle_later_the_reference_is_mirrored(phase):
     permutation, sign = robot.mirror_joints()
     np.testing.assert_allclose(
-        pose(phase + 0.5, 3.0, GROWING), pose(phase, 3.0, GROWING)[permutation] * sign, atol=1e-6
+        pose(phase + 0.5, 3.0, SWEEPING), pose(phase, 3.0, SWEEPING)[permutation] * sign, atol=1e-6
     )
 
 

@@ -20,6 +20,7 @@ DT = 0.01
 KSLC = preset("paper").rewards
 HG = preset("baseline").rewards
 LATERAL = dataclasses.replace(KSLC, lateral_distance=True)
+MID_SWING = dataclasses.replace(KSLC, clearance_mid_swing=True)
 LEAN = dataclasses.replace(KSLC, lean_per_speed=0.1)
 LOOSE = dataclasses.replace(
     KSLC, momentum_scale=10.0, clearance_width=0.03, base_height_kernel=30.0
@@ -157,6 +158,26 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("feet_clearance", KSLC, {"swing_height": [1.0, 0], "stance": [False, True]}, 0.0),
     # Width 0.03, error 0.03.
     ("feet_clearance", LOOSE, {"swing_height": [0.09, 0], "stance": [False, True]}, 0.36787944),
+    # Mid-swing, sin = -1: 2 x 1; a twelfth of a cycle after touchdown of the other foot, sin = 0.5:
+    # 2 x 0.25; at lift-off nothing.
+    (
+        "feet_clearance",
+        MID_SWING,
+        {"swing_height": [0.06, 0], "stance": [False, True], "clock": [-1.0, 0.0]},
+        2.0,
+    ),
+    (
+        "feet_clearance",
+        MID_SWING,
+        {"swing_height": [0, 0.07], "stance": [True, False], "clock": [0.5, 0.8660254]},
+        0.5 * 0.36787944,
+    ),
+    (
+        "feet_clearance",
+        MID_SWING,
+        {"swing_height": [0.06, 0], "stance": [False, True], "clock": [0.0, 1.0]},
+        0.0,
+    ),
     # HG: a window of +-0.01 around 0.06 at every speed.
     ("feet_clearance", HG, {"swing_height": [0.069, 0], "stance": [False, True]}, 1.0),
     ("feet_clearance", HG, {"swing_height": [0.071, 0], "stance": [False, True]}, 0.0),

@@ -10,6 +10,7 @@ docs/fidelity.md.
 
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
+    COUNTER,
     NUM_JOINTS,
     CommandConfig,
     Config,
@@ -31,6 +32,7 @@ from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
 
 __all__ = [
     "ABLATIONS",
+    "COUNTER",
     "NUM_JOINTS",
     "PRESETS",
     "SCHEMA_VERSION",
