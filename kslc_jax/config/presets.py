@@ -65,7 +65,13 @@ _LAPTOP = _override(
         "cycle_follows_speed": True,
         "random_phase": True,
     },
-    curriculum={"settle_seconds": 2.0, "v_limit": 4.5, "gait_threshold": 0.75},
+    curriculum={
+        "settle_seconds": 2.0,
+        "v_limit": 4.5,
+        "gait_threshold": 0.75,
+        "cycle_factor": 0.925,
+        "cycle_min": 0.38,
+    },
     randomize={
         "base_com": (-0.02, 0.02),
         "kp": (0.9, 1.1),
@@ -76,14 +82,16 @@ _LAPTOP = _override(
     },
     rewards={
         "base_height_kernel": 30.0,
+        "base_height_drop": 0.0,
         "clearance_width": 0.03,
         "clearance_mid_swing": True,
+        "clearance_speed_gain": 0.5,
         "max_contact_force": 1400.0,
         "lateral_distance": True,
         "lean_per_speed": 0.03,
         "weights": {
             "feet_contact_number": 2.0,
-            "feet_clearance": 1.5,
+            "base_height": 0.5,
             "tracking_lin_vel": 1.6,
             "track_vel_hard": 0.8,
             "tracking_mean_vel": 1.0,
