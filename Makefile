@@ -7,10 +7,10 @@ STAMP := $(VENV)/.installed
 # setuptools warns of editable installs whose package lies beside pyproject.toml; ours should.
 PIP := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: help train test test-all lint bench bench-full clean
+.PHONY: help train test test-all test-notebooks lint bench bench-full clean
 
 help: ## What there is
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -29,6 +29,9 @@ test: $(STAMP) ## Quick test suite, a few minutes
 
 test-all: $(STAMP) ## All tests, slow ones too
 	@$(BIN)/python -m pytest -m "" $(ARGS)
+
+test-notebooks: $(STAMP) ## Executes the three notebooks, shortened: a few minutes
+	@$(BIN)/python -m pytest -n 2 -m "" tests/test_notebooks.py $(ARGS)
 
 lint: $(STAMP) ## ruff and ty
 	@$(BIN)/ruff check .

@@ -86,12 +86,19 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
 
 
 def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
-    """Use of the motors, and cost of transport."""
+    """Use of the motors, and cost of transport.
+
+    The cost of transport is the mechanical work of the motors per weight moved and metre gone,
+    P / (m g |vx|), without a unit. P [W] is sum |torque x joint speed|: a motor that brakes gives
+    nothing back, heat is not counted. m [kg] is the robot with its payload, vx [m/s] the base's
+    forward velocity. Means are over time and trials.
+    """
     s = _steady(trace, dt)
     power = np.abs(s.torque * s.joint_vel).sum(-1).mean()
-    speed = abs(float(s.linvel[..., 0].mean()))
+    forward = np.asarray(s.linvel[..., 0])
+    moved = GRAVITY * abs(float((s.mass * forward).mean()))
     load = np.abs(s.torque) / robot.effort_limit
-    transport = float(power / (robot.total_mass * GRAVITY * speed)) if speed > RESTING else None
+    transport = float(power / moved) if abs(forward.mean()) > RESTING else None
     return ({} if transport is None else {"cost_of_transport": transport}) | {
         "within_speed_limits": float((np.abs(s.joint_vel) <= robot.speed_limit).all(-1).mean()),
         "peak_torque_share": float(load.max()),
@@ -175,7 +182,7 @@ def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     """Root mean square angular momentum of the whole body, its arms and its legs: all of it, and
-    about the vertical alone."""
+    about the vertical alone. Arms and legs are taken without a payload."""
     s = _steady(trace, dt)
     squares = (s.angular_momentum**2).mean((0, 1))
     out = {

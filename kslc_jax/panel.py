@@ -20,6 +20,8 @@ SIDE_MARGIN = 0.2
 
 RATES = {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
 
+TITLE = "kslc_jax"
+
 PLOT_SECONDS = 6.0
 PLOT_HEIGHT = 130
 """Pixels."""
@@ -50,10 +52,11 @@ class Panel:
     def __init__(self, server: viser.ViserServer, names: Sequence[str], config: CommandConfig):
         """`names` of the policies to choose from; the trained ranges come from `config`."""
         self.paused = False
+        self._gui, self._title = server.gui, TITLE
         self._reset_wanted, self._push_wanted = threading.Event(), threading.Event()
         gui = server.gui
         turn = max(config.max_yaw_rate, STEP[2])
-        gui.set_panel_label("kslc_jax")
+        gui.set_panel_label(TITLE)
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.status = gui.add_markdown("")
         with gui.add_folder("Command"):
@@ -125,6 +128,13 @@ class Panel:
         angle = rng.uniform(0.0, 2.0 * np.pi)
         return self._push.value * np.array([np.cos(angle), np.sin(angle)])
 
+    def title(self, factor: float, slow: bool) -> None:
+        """Says that time runs slow where it is seen even when the panel is folded up."""
+        title = f"{TITLE}, {factor:.2f}x real time" if slow else TITLE
+        if title != self._title:
+            self._title = title
+            self._gui.set_panel_label(title)
+
     def plot(self, recent: Sequence[View], now: float, dt: float) -> None:
         """Draws the latest views, `dt` [s] apart up to the time `now` [s]; every second one."""
         views = recent[::-2][::-1]
@@ -182,11 +192,15 @@ def _plots(gui: viser.GuiApi) -> tuple[viser.GuiUplotHandle, viser.GuiUplotHandl
     return speed, gait
 
 
-def status(view: View, speed: float, factor: float, policy: Policy, paused: bool) -> str:
-    """The text above the controls, Markdown."""
+def status(
+    view: View, speed: float, factor: float, slow: bool, policy: Policy, paused: bool
+) -> str:
+    """The text above the controls, Markdown; `factor` of real time is `slow` for what is asked."""
     how = "**fallen**" if view.fallen else "paused" if paused else "up"
+    pace = f"real-time factor {factor:.2f}"
+    pace = f"**{pace}, too slow**" if slow else pace
     return (
         f"**{speed:z.2f} m/s** of {view.command[0]:.2f} commanded, {how}  \n"
-        f"real-time factor {factor:.2f}, train step {policy.step}, "
+        f"{pace}, train step {policy.step}, "
         f"trained up to {float(policy.curriculum.v_max):.1f} m/s"
     )

@@ -46,6 +46,7 @@ class Trace:
     """What was recorded, [T, N, ...]; nothing counts from a fall on, where `alive` is False."""
 
     alive: jax.Array  # bool
+    mass: jax.Array  # kg, of the robot and what it carries
     qpos: jax.Array  # [23]
     linvel: jax.Array  # [3] m/s, base frame
     angvel: jax.Array  # [3] rad/s, base frame
@@ -159,6 +160,7 @@ def _record(robot, state: env.EnvState, alive: jax.Array) -> Trace:
     now = jax.vmap(lambda s: signals.read(robot, s))(state.physics)
     return Trace(
         alive=alive,
+        mass=robot.total_mass + state.dynamics.base_mass,
         qpos=state.physics.qpos,
         linvel=now.base_linvel,
         angvel=now.base_angvel,

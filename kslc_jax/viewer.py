@@ -39,6 +39,9 @@ CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
 SPEED_SECONDS = 1.0
 """Span over which the actual speed and the real-time factor are taken."""
 
+SLOW = 0.95
+"""Share of the asked playback speed below which the page says that it is too slow."""
+
 
 # -------------------------------------------------------------------------------------------- robot
 
@@ -186,7 +189,8 @@ class Viewer:
         self._pacer = Pacer(self.session.dt)
         shown = round(panel.PLOT_SECONDS / self.session.dt)
         self._recent: collections.deque[View] = collections.deque(maxlen=shown)
-        self._paced = collections.deque([(0.0, 0.0)], maxlen=round(SPEED_SECONDS * FPS))
+        self._paced: collections.deque[tuple[float, float, float]]  # s: clock, simulated, asked
+        self._paced = collections.deque(maxlen=round(SPEED_SECONDS * FPS))
         self._drawn = 0.0
         self.reset()
 
@@ -213,11 +217,14 @@ class Viewer:
         if self.panel.take_reset():
             self.reset()
         idle = self.panel.paused or not self.server.get_clients()
-        steps = self._pacer.due(now, 0.0 if idle else panel.RATES[self.panel.rate.value])
+        rate = 0.0 if idle else panel.RATES[self.panel.rate.value]
+        steps = self._pacer.due(now, rate)
         for _ in range(steps):
             push = self.panel.take_push(self._rng)
             self._recent.append(self.session.advance(self.panel.command, push))
-        self._paced.append((now, self._paced[-1][1] + steps * self.session.dt))
+        before, simulated, asked = self._paced[-1] if self._paced else (now, 0.0, 0.0)
+        asked += rate * (now - before)
+        self._paced.append((now, simulated + steps * self.session.dt, asked))
         if steps:
             self.figure.follow = self.panel.follow.value
             self.figure.show(self.session.view)
@@ -227,13 +234,17 @@ class Viewer:
 
     def _report(self) -> None:
         """Plots and status text."""
-        (began, start), (now, end) = self._paced[0], self._paced[-1]
-        self.panel.plot(list(self._recent), end, self.session.dt)
+        seconds, simulated, wanted = np.subtract(self._paced[-1], self._paced[0])
+        factor = simulated / max(seconds, 1e-6)
+        slow = simulated < SLOW * wanted - self.session.dt  # a step may be due and not yet done
+        self.panel.title(factor, slow)
+        self.panel.plot(list(self._recent), self._paced[-1][1], self.session.dt)
         last = [v.velocity[0] for v in self._recent][-round(SPEED_SECONDS / self.session.dt) :]
         self.panel.status.content = panel.status(
             self.session.view,
             speed=float(np.mean(last)) if last else 0.0,
-            factor=(end - start) / max(now - began, 1e-6),
+            factor=factor,
+            slow=slow,
             policy=self.session.policy,
             paused=self.panel.paused,
         )

@@ -32,6 +32,8 @@ from kslc_jax.config import ConfigError, PhysicsConfig, preset
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
 ROBOTS = 8
+STEPPED = PhysicsConfig(engine="mujoco", timestep=0.001, decimation=10, clamp_joint_speed=False)
+"""The runner's physics: no joint speed is cut, the motors' law alone holds it at 1 ms."""
 
 
 @functools.cache
@@ -260,7 +262,7 @@ def test_onnx_missing_is_one_line(saved, tmp_path, monkeypatch, capsys):
 @pytest.fixture(scope="module")
 def trajectory(policy):
     """Environments from the default pose under their own commands, 101 states."""
-    config = trials.trial_config(policy.config, trials.Setting(policy.config.physics), ROBOTS)
+    config = trials.trial_config(policy.config, trials.Setting(STEPPED), ROBOTS)
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, reset_joint_noise=0.0))
 
     def run(key):
@@ -302,6 +304,7 @@ def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
     """Servo solve, torques, decimation and actions: 0.8 s of the robot, by itself."""
     steps = 80
     model = mujoco.MjModel.from_xml_path(str(robot.MODEL_PATH))
+    model.opt.timestep = STEPPED.timestep
     for i in range(ROBOTS):
         controller = controller_of(runner, onnx_file, trajectory, i)
         track = runner.simulate(controller, model, 0.01 * steps)

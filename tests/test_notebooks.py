@@ -9,7 +9,7 @@ import nbclient
 import nbformat
 import pytest
 
-from kslc_jax import plots
+from kslc_jax import plots, rewards
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum")
@@ -81,6 +81,17 @@ def test_quickstart(execute):
     assert ("video/mp4" in nbformat.writes(notebook)) == drawn
 
 
+def test_quickstart_where_nothing_can_be_drawn(tmp_path, monkeypatch):
+    """A GL that is there and does not work is a word to the reader, not an error."""
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setenv("PYOPENGL_PLATFORM", "nonsense")
+    notebook = read("01_quickstart")
+    notebook.cells = [cell for cell in notebook.cells if "import render" in cell.source]
+    where = {"metadata": {"path": str(tmp_path)}}
+    nbclient.NotebookClient(notebook, timeout=600, resources=where).execute()
+    assert text(notebook).startswith("no pictures here: MUJOCO_GL=osmesa does not work here")
+
+
 @pytest.mark.slow(reason="a minute: two trainings, and trials of a policy")
 def test_train_and_evaluate(execute, tmp_path):
     """The second training goes on where the first stopped; the table has a row per speed."""
@@ -106,4 +117,32 @@ def test_rewards_and_curriculum(execute):
     assert len(re.findall("^v_max .* m/s from", text(notebook), re.M)) == len(
         plots.milestones(stored)
     )
-    assert pictures(notebook) == 9
+    assert pictures(notebook) == 13
+
+
+def test_every_reward_term_is_shown():
+    """The paper's four one by one; each of the others as one panel, and in a sentence."""
+    cells = read("03_rewards_and_curriculum").cells
+    code, prose = (
+        "\n".join(cell.source for cell in cells if cell.cell_type == kind)
+        for kind in ("code", "markdown")
+    )
+    papers = {"angular_momentum", "base_height", "feet_clearance", "joint_pos"}
+    assert all(f"reward(rewards.{name}, " in code for name in papers)
+    others = re.findall(r'^    \("(\w+)", ', code, re.M)
+    assert sorted(others) == sorted(set(rewards.TERMS) - papers)
+    assert all(f"\n- `{name}`: " in prose for name in others)
+
+
+def test_without_a_checkout_the_address_is_asked_for(tmp_path, monkeypatch):
+    """Rather than what git says of a repository that nobody has; the same cell in all of them."""
+    monkeypatch.delenv("KSLC_REPO", raising=False)
+    first, *others = (
+        [cell for cell in read(name).cells if "git clone" in cell.source] for name in NAMES
+    )
+    assert [[cell.source for cell in cells] for cells in others] == [[first[0].source]] * 2
+    notebook = nbformat.v4.new_notebook(cells=first)
+    client = nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}})
+    with pytest.raises(nbclient.exceptions.CellExecutionError) as error:
+        client.execute()
+    assert error.value.evalue == "write the address of your copy of kslc_jax into URL, in this cell"

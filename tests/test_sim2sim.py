@@ -85,6 +85,21 @@ def test_perturbations_reach_the_robot():
     assert sim2sim.setting(sim2sim.Args("x"), "imu=0.03").imu_offset == (0.03, 0.03)
 
 
+@pytest.mark.parametrize(
+    ("condition", "kg"), [("nominal", 0), ("payload=5", 5), ("payload=-5", -5)]
+)
+def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
+    random_policy, condition, kg
+):
+    """The trace's mass is that of the model which the engine steps: 53.036 kg and the payload."""
+    setting = dataclasses.replace(sim2sim.setting(sim2sim.Args("x"), condition), seconds=0.03)
+    trace = next(iter(trials.run(random_policy, setting, np.zeros((2, 3)), chunk=0.03)))
+    np.testing.assert_allclose(trace.mass, np.full((3, 2), 53.036 + kg), atol=1e-3)
+    xbot = robot.load("high")
+    fields = randomize.model_fields(xbot, dynamics(condition)[0], 1.0)
+    assert float(fields["body_mass"].sum()) == pytest.approx(trace.mass[0, 0], abs=1e-4)
+
+
 def test_all_runs_ten_perturbations_after_the_nominal_robot():
     conditions = sim2sim.Args("x", perturb=("all",)).conditions
     assert conditions[0] == "nominal" and len(set(conditions)) == 11

@@ -58,6 +58,7 @@ def synthetic(seconds=11.6, frequency=1.25, speed=2.0):
     zeros = np.zeros((steps, n, 3))
     return trials.Trace(
         alive=np.ones((steps, n), bool),
+        mass=np.full((steps, n), 53.036),
         qpos=q,
         linvel=zeros + np.array([speed, 0, 0]),
         angvel=zeros,
@@ -84,6 +85,22 @@ def test_metrics_of_a_known_gait(xbot):
     assert m["shoulder_range"] == pytest.approx(0.6, rel=0.05)
     assert m["momentum_rms"] == pytest.approx(5.0) and m["momentum_yaw_rms"] == pytest.approx(4.0)
     assert m["within_speed_limits"] == 1.0 and m["cost_of_transport"] == 0.0
+
+
+def test_cost_of_transport_counts_the_mass_that_was_moved(xbot):
+    """16 joints x 1 N m x 3 rad/s = 48 W, forwards or backwards at 2 m/s with 60 kg; then 50 kg at
+    2 m/s and 70 kg at 3 m/s, each with 48 W."""
+
+    def cost(trace):
+        return gait_metrics.effort(trace, xbot, DT)["cost_of_transport"]
+
+    trace = synthetic()
+    trace = trace.replace(joint_vel=trace.joint_vel - 3.0, mass=0.0 * trace.mass + 60.0)
+    assert cost(trace) == pytest.approx(48.0 / (9.81 * 120.0))
+    assert cost(trace.replace(linvel=-trace.linvel)) == pytest.approx(48.0 / (9.81 * 120.0))
+    faster = trace.linvel * np.array([1.0, 1.5])[:, None]
+    two = trace.replace(mass=0.0 * trace.mass + [50.0, 70.0], linvel=faster)
+    assert cost(two) == pytest.approx(48.0 / (9.81 * 155.0))
 
 
 def test_a_chattering_foot_lands_once():

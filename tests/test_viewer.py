@@ -200,6 +200,29 @@ def test_frames_step_only_while_watched(viewer, monkeypatch):
     viewer.panel._stop()
 
 
+def test_the_page_says_when_it_is_too_slow(viewer, monkeypatch):
+    """Frames 0.2 s apart make up for 0.1 s: half of real time at 1x, all that is asked at 0.5x."""
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: None})
+    titles = []
+    monkeypatch.setattr(viewer.panel._gui, "set_panel_label", titles.append)
+    viewer._paced.clear()
+
+    def play(start, apart, frames):
+        for i in range(frames):
+            viewer.frame(start + i * apart)
+        return viewer.panel.status.content
+
+    assert "\nreal-time factor 1.00, train step" in play(1000.0, 0.05, 30)
+    assert "**real-time factor 0.50, too slow**, train step" in play(1001.5, 0.2, 40)
+    assert titles[-1] == "kslc_jax, 0.50x real time"
+    viewer.panel.rate.value = "0.5x"
+    assert "\nreal-time factor 0.50, train step" in play(1009.5, 0.2, 40)
+    viewer.panel.rate.value = "1x"
+    viewer.panel._pause()
+    assert "paused" in play(1017.5, 0.05, 1) and titles[-1] == "kslc_jax"
+    viewer.panel._pause()
+
+
 def test_policies_of_a_run(run_dir):
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
     from kslc_jax.viewer import policies
