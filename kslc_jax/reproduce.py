@@ -152,7 +152,7 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     args = tyro.cli(Args, args=argv, description=__doc__)
     from kslc_jax.checkpoint import CheckpointError
-    from kslc_jax.runner import RunError
+    from kslc_jax.run_folder import RunError
 
     try:
         rows = repeat(args)
