@@ -63,13 +63,13 @@ class _Job:
     progress: Progress
     keeper: Onlooker
     profile: profiling.Profile
+    like: TrainState  # shapes
     init: Callable[[], TrainState]
     step: Any  # jitted
 
     def restored(self) -> TrainState:
         """The latest whole checkpoint, on its devices."""
-        like = jax.eval_shape(self.init)
-        state = devices.from_first(lambda: self.keeper.restore(like), like)
+        state = devices.from_first(lambda: self.keeper.restore(self.like), self.like)
         return state if self.mesh is None else devices.place(self.mesh, state)
 
 
@@ -99,7 +99,8 @@ def train(
       Elsewhere: one of these in the first process, where this is another.
     """
     init, step = train_step.make(config) if mesh is None else devices.make(config, mesh)
-    memory.check(config, jax.eval_shape(init), 1 if mesh is None else mesh.size)
+    like = jax.eval_shape(init)
+    memory.check(config, like, 1 if mesh is None else mesh.size)
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(progress))
         disk = DiskProcess() if devices.several() and devices.is_first() else Disk()
@@ -117,7 +118,9 @@ def train(
             progress.warn,
         )
         kept = keeper or Onlooker()
-        return _persist(_Job(config, run_dir, resume, mesh, progress, kept, tracing, init, step))
+        return _persist(
+            _Job(config, run_dir, resume, mesh, progress, kept, tracing, like, init, step)
+        )
 
 
 @contextlib.contextmanager
@@ -176,7 +179,7 @@ def _persist(job: _Job) -> TrainState:
     state = job.restored() if job.resume else job.init()
     if job.resume:
         job.progress.say(f"resumed at train step {int(state.step)}")
-    compiled = job.step.lower(jax.eval_shape(job.init)).compile()
+    compiled = job.step.lower(job.like).compile()
     seconds, need = time.monotonic() - start, memory.measured(compiled)
     needs = f", needs {memory.shown(need)}" if need else ""
     job.progress.say(f"compiled in {seconds:.0f} s{needs}; training")

@@ -181,8 +181,9 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     except (ConfigError, RunError, CheckpointError, devices.Elsewhere) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except NumbersError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except NumbersError as error:  # all processes meet it
+        if devices.is_first():
+            print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted before the state was saved", file=sys.stderr)

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -45,17 +46,18 @@ def started(stack: contextlib.ExitStack, *args: Any, processes: int = 2, forced:
     return children
 
 
-def ended(children: list, code: int = 0, within: float = 500.0) -> list[tuple[str, str]]:
-    """What they say on (stdout, stderr), once all have ended with this exit code."""
+def ended(children: list, code: int = 0, within: float = 5000.0) -> list[tuple[str, str]]:
+    """What they say on (stdout, stderr), once all have ended with this exit code; without what
+    XLA's way between CPUs prints."""
     said = [child.communicate(timeout=within) for child in children]
     assert [child.returncode for child in children] == [code] * len(children), said
-    return said
+    return [(re.sub(r"(?m)^\[Gloo\].*\n", "", out), err) for out, err in said]
 
 
 def alone(*args: Any, devices: int = 1) -> str:
     """What one process says that has ended well."""
     how = command(*args, "--devices", devices, forced=devices)
-    done = subprocess.run(**how, timeout=500, check=False)
+    done = subprocess.run(**how, timeout=5000, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -65,7 +67,7 @@ def rows(run_dir: Path) -> list[dict[str, float]]:
 
 
 def wait_for_rows(run_dir: Path, count: int, children: list) -> None:
-    for _ in range(5000):
+    for _ in range(50000):
         if (run_dir / "metrics.jsonl").exists() and len(rows(run_dir)) >= count:
             return
         assert all(child.poll() is None for child in children), children[0].communicate()
