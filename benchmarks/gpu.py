@@ -32,7 +32,7 @@ import orbax.checkpoint as ocp
 import tyro
 
 from benchmarks import throughput, timing
-from kslc_jax import checkpoint, train_step
+from kslc_jax import checkpoint, memory, train_step
 from kslc_jax.checkpoint import BEST_METRIC, Store
 from kslc_jax.config import Config, preset
 from kslc_jax.train_step import TrainState
@@ -149,9 +149,11 @@ def train(args: "Args", config: Config, deadline: float) -> dict[str, Any]:
     begun = time.monotonic()
     compiled = step.lower(state).compile()
     result = {"compile seconds": time.monotonic() - begun, "first step": int(state.step) + 1}
-    used = compiled.memory_analysis()
+    like = jax.eval_shape(init)
+    result["GiB estimated"] = memory.estimate(config, like) / 2**30
+    used = memory.measured(compiled)
     if used is not None:
-        result["GiB by XLA"] = (used.temp_size_in_bytes + used.argument_size_in_bytes) / 2**30
+        result["GiB by XLA"] = used / 2**30
     begun, done, saved = time.monotonic(), 0, time.monotonic()
     record: dict[str, float] = {}
     with (args.out / "metrics.jsonl").open("w") as file:

@@ -1,14 +1,23 @@
 """Memory and speed of whole training over environments and frames; one process for each point.
 
 `peak` is all that the process ever held, on an accelerator what the device did. `estimated` is what
-`runner.check_memory` reckons before anything is compiled.
+`kslc_jax.memory` reckons before anything is compiled, `planned` what XLA says once it is; on a CPU
+the process holds its own imports, the compiler and two states besides.
+
+A point that does not fit, by the estimate or by its death, is told and left out. What is measured
+is drawn, also where the time is up before the end.
 
   python -m benchmarks.memory [--num-envs 256 1024 4096 16384] [--frames 1 5 15] [--out memory.png]
+  python -m benchmarks.memory --minutes 8           # begins no new point after that
   python -m benchmarks.memory --preset paper --num-envs 4096 --frames 15
 """
 
+import contextlib
 import json
 import resource
+import subprocess
+import sys
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,26 +33,33 @@ import matplotlib.pyplot as plt
 
 MIB = 2**20
 
+TOO_LARGE = 3
+"""Exit code of a process whose point does not fit."""
+
 
 def once(preset_name: str, num_envs: int, frames: int, repeats: int) -> dict[str, float]:
     """One point, in this process: MiB and control steps/s."""
     import jax
 
     from benchmarks import throughput
-    from kslc_jax import runner, train_step
+    from kslc_jax import memory, train_step
     from kslc_jax.config import preset
 
     config = timing.resized(preset(preset_name), num_envs, frames)
-    estimated = runner.memory_need(config, jax.eval_shape(train_step.make(config)[0]))
+    init, step = train_step.make(config)
+    like = jax.eval_shape(init)
+    memory.check(config, like)
     before = _peak()
-    run = {"training": throughput.training(config)}
+    compiled = step.lower(like).compile()
+    run = {"training": throughput.stepping(init, compiled)}
     seconds = timing.medians(timing.in_turn(run, repeats))["training"]
     return {
         "num_envs": num_envs,
         "frames": frames,
         "before_mib": before / MIB,
         "peak_mib": _peak() / MIB,
-        "estimated_mib": estimated / MIB,
+        "estimated_mib": memory.estimate(config, like) / MIB,
+        "planned_mib": (memory.measured(compiled) or 0) / MIB,
         "steps_per_second": config.batch_size / seconds,
     }
 
@@ -55,6 +71,43 @@ def _peak() -> int:
     stats = jax.devices()[0].memory_stats() or {}
     in_process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return stats.get("peak_bytes_in_use", in_process)
+
+
+def child(args: "Args", num_envs: int, frames: int) -> dict[str, float] | None:
+    """One point, in a process of its own; None where it did not fit or was killed."""
+    where = ["--num-envs", str(num_envs), "--frames", str(frames), "--preset", args.preset]
+    try:
+        return timing.child("benchmarks.memory", [*where, "--repeats", str(args.repeats), "--here"])
+    except subprocess.CalledProcessError as error:
+        if error.returncode != TOO_LARGE and error.returncode >= 0:
+            raise
+        return None
+
+
+def here(args: "Args") -> int:
+    """Measures the first point in this process; returns the exit code."""
+    from jax.errors import JaxRuntimeError
+
+    from kslc_jax.config import ConfigError
+
+    with contextlib.suppress(OSError):  # if memory runs out, the system is to kill this process
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    try:
+        print(json.dumps(once(args.preset, args.num_envs[0], args.frames[0], args.repeats)))
+    except (ConfigError, MemoryError, JaxRuntimeError) as error:
+        if isinstance(error, JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        return TOO_LARGE
+    return 0
+
+
+def line(point: dict[str, float]) -> str:
+    """A point in words."""
+    return (
+        f"{point['peak_mib']:7.0f} MiB (before it compiled {point['before_mib']:.0f}; estimated "
+        f"{point['estimated_mib']:.0f}, planned {point['planned_mib']:.0f}), "
+        f"{point['steps_per_second']:7.0f} steps/s"
+    )
 
 
 def draw(points: list[dict[str, Any]], title: str, out: Path) -> None:
@@ -70,7 +123,7 @@ def draw(points: list[dict[str, Any]], title: str, out: Path) -> None:
         axes[0].loglog(envs, [p["estimated_mib"] / 1024 for p in mine], ":", **style)
         axes[1].semilogx(envs, [p["steps_per_second"] / 1e3 for p in mine], "o-", **style)
     axes[0].plot([], [], "k:", label="estimated before compiling")
-    axes[0].set_ylabel("peak memory above the imports' [GiB]")
+    axes[0].set_ylabel("peak memory above that before compiling [GiB]")
     axes[0].legend(fontsize=8)
     axes[1].set_ylabel("whole training [1000 control steps/s]")
     axes[1].set_ylim(bottom=0)
@@ -95,6 +148,8 @@ class Args:
     """Frames of actor history."""
     repeats: int = 1
     """Timed train steps at each point."""
+    minutes: float = 60.0
+    """When no new point is begun."""
     out: Path | None = None
     """Picture of both."""
     json: Path | None = None
@@ -106,23 +161,19 @@ class Args:
 def main(args: Args) -> None:
     """Prints a table."""
     if args.here:
-        print(json.dumps(once(args.preset, args.num_envs[0], args.frames[0], args.repeats)))
-        return
+        sys.exit(here(args))
+    end = time.monotonic() + 60.0 * args.minutes
+    grid = [(n, frames) for frames in args.frames for n in args.num_envs]
     points = []
-    for frames in args.frames:
-        for num_envs in args.num_envs:
-            where = ["--num-envs", str(num_envs), "--frames", str(frames)]
-            where += ["--preset", args.preset, "--repeats", str(args.repeats), "--here"]
-            point = timing.child("benchmarks.memory", where)
-            points.append(point)
-            print(
-                f"{num_envs:6} environments, {frames:2} frames: "
-                f"{point['peak_mib']:7.0f} MiB (imports {point['before_mib']:.0f}, "
-                f"estimated {point['estimated_mib']:.0f}), "
-                f"{point['steps_per_second']:7.0f} steps/s",
-                flush=True,
-            )
-    if args.out is not None:
+    for i, (num_envs, frames) in enumerate(grid):
+        if time.monotonic() > end:
+            print(f"{args.minutes:g} minutes are over: {len(grid) - i} points are left out")
+            break
+        print(f"[{i + 1}/{len(grid)}] {num_envs:6} environments, {frames:2} frames: ", end="")
+        point = child(args, num_envs, frames)
+        points += [point] if point else []
+        print(line(point) if point else "does not fit", flush=True)
+    if args.out is not None and points:
         draw(points, f"{args.preset} preset, {timing.machine()['device']}", args.out)
     timing.report({"preset": args.preset, "points": points}, args.json)
 

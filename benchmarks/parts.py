@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from benchmarks import throughput, timing
-from kslc_jax import networks, ppo, train_step
+from kslc_jax import networks, ppo, profiling, train_step
 from kslc_jax.config import Config, preset
 
 matplotlib.use("Agg")
@@ -118,12 +118,12 @@ def draw(results: dict[str, dict[str, float]], title: str, out: Path) -> None:
 
 
 def trace(config: Config, folder: Path) -> None:
-    """The JAX profiler's trace of one train step, compiled beforehand."""
+    """The profiler's trace of one train step, compiled beforehand."""
     run = throughput.training(config)
     run()
-    with jax.profiler.trace(str(folder)):
+    with profiling.trace(str(folder)):
         run()
-    print(f"wrote {folder}; open it with `xprof --logdir {folder}`")
+    print(f"wrote {folder}; {profiling.how_to_open(folder)}")
 
 
 @dataclass(frozen=True)

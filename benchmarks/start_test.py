@@ -13,10 +13,13 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from typing import Literal
 
 import tyro
 
-KINDS = (("mujoco", 1), ("mujoco", 2), ("mjx", 1), ("mjx", 2))
+Engine = Literal["mujoco", "mjx"]
+
+KINDS: tuple[tuple[Engine, int], ...] = (("mujoco", 1), ("mujoco", 2), ("mjx", 1), ("mjx", 2))
 """Engine, and how many threads: of C MuJoCo's batch, or of all that XLA runs on."""
 
 LIMIT = 300.0
@@ -25,7 +28,7 @@ LIMIT = 300.0
 ROBOTS, STEPS = 256, 100
 
 
-def rollout(engine: str, threads: int) -> None:
+def rollout(engine: Engine, threads: int) -> None:
     """What one start does."""
     from kslc_jax import runtime
 
@@ -56,7 +59,7 @@ def rollout(engine: str, threads: int) -> None:
         sys.exit("numbers that are not finite")
 
 
-def start(engine: str, threads: int) -> str:
+def start(engine: Engine, threads: int) -> str:
     """Starts one process; 'ok', 'hung' or 'failed'."""
     command = [sys.executable, "-m", "benchmarks.start_test", "--once", engine, str(threads)]
     if engine == "mjx" and threads == 1:
@@ -71,7 +74,7 @@ def start(engine: str, threads: int) -> str:
     return "failed" if done.returncode else "ok"
 
 
-def main(starts: int = 200, once: tuple[str, int] | None = None) -> int:
+def main(starts: int = 200, once: tuple[Engine, int] | None = None) -> int:
     """Prints how the starts ended; 1 if any did not end well.
 
     Args:

@@ -97,7 +97,16 @@ def main(args: Args) -> None:
         results[engine] = measure(timing.on_engine(base, engine), args.repeats)
         for name, rate in results[engine].items():
             share = rate / results[engine]["physics only"]
-            print(f"{engine:8} {name:16} {rate:9.0f} steps/s   {share:5.2f} of physics only")
+            print(
+                f"{engine:8} {name:16} {rate:9.0f} steps/s   {share:5.2f} of physics only",
+                flush=True,
+            )
+    whole = {engine: rates["whole training"] for engine, rates in results.items()}
+    best = max(whole, key=lambda engine: whole[engine])
+    for engine in whole.keys() - {best}:
+        print(
+            f"whole training: {best} is {whole[best] / whole[engine]:.2f} times as fast as {engine}"
+        )
     timing.report({"preset": args.preset, "steps_per_second": results}, args.json)
 
 

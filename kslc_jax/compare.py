@@ -63,7 +63,7 @@ class Args:
         for name in ("seeds", "ablation_seeds"):
             if any(not 0 <= seed < config_lib.COUNTER for seed in getattr(self, name)):
                 raise ConfigError(f"{name} must not be negative, nor above 2^31")
-        evaluate.check(self.speeds, self.trials, 1.0)
+        evaluate.check(self.speeds, self.trials, evaluate.Args.seconds)
 
 
 @dataclass(frozen=True)

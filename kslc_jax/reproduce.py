@@ -156,7 +156,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
     from kslc_jax.checkpoint import CheckpointError
-    from kslc_jax.runner import RunError
+    from kslc_jax.run_folder import RunError
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)

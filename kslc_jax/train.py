@@ -10,20 +10,27 @@ Examples:
   python -m kslc_jax.train --preset laptop --without arms --seed 1
   python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
   python -m kslc_jax.train --resume --run-dir runs/laptop-seed0
+  python -m kslc_jax.train --profile 3              # where does the time go?
+  srun python -m kslc_jax.train --coordinator auto  # one training of all of Slurm's tasks
 """
 
 import argparse
 import dataclasses
+import re
 import sys
+import traceback
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from kslc_jax import config as config_lib
 from kslc_jax import runtime
 from kslc_jax.config import Config, ConfigError
+
+if TYPE_CHECKING:
+    from jax.sharding import Mesh
 
 
 @dataclass(frozen=True)
@@ -45,8 +52,53 @@ class Args:
     start_from: Path | None = None
     """Begin a new training with this policy's networks and curriculum: a run folder, a checkpoint
     folder, or the name of a shipped policy. A lower --ppo.learning-rate keeps what it can do."""
+    profile: int = 0
+    """Write the profiler's trace of this many train steps, after the first, into the run folder."""
+    devices: Literal["auto"] | int = "auto"
+    """How many of this process's devices to train on. auto: as many accelerators as share the
+    environments evenly; of CPUs one."""
+    coordinator: str | None = None
+    """One training of several processes: host:port where process 0 can be reached, or auto where
+    Slurm, Open MPI, Kubernetes or a TPU pod tells. Each process gets the same command line, but
+    for --process-index."""
+    processes: int | None = None
+    """How many processes there are, with --coordinator host:port."""
+    process_index: int | None = None
+    """Which of them this is, from 0. The first one reads, writes and speaks."""
     config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS["laptop"]
     """Every number of the training, as the preset has it."""
+
+
+def join(argv: list[str]) -> None:
+    """Makes this process one of several where the command line says so, before JAX does anything
+    else; ConfigError if it cannot."""
+    early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("coordinator", "processes", "process-index"):
+        early.add_argument(f"--{name}", f"--{name.replace('-', '_')}", dest=name)
+    known, _ = early.parse_known_args(argv)
+    given = tuple(vars(known).values())
+    if any(given) and not {"-h", "--help"} & set(argv):
+        who = cluster(*given)
+        from kslc_jax import devices
+
+        devices.join(*who)
+
+
+def cluster(
+    coordinator: str | None, processes: str | None, index: str | None
+) -> tuple[str | None, int | None, int | None]:
+    """What `devices.join` takes, of three options' values; ConfigError if they make no sense."""
+    if (coordinator, processes, index) == ("auto", None, None):
+        return None, None, None
+    counts = [int(c) for c in (processes, index) if c is not None and c.isdecimal()]
+    if len(counts) < 2 or not re.fullmatch(r"\S+:\d{1,5}", coordinator or ""):
+        raise ConfigError(
+            "several processes need --coordinator host:port, --processes N and --process-index I, "
+            "or --coordinator auto alone"
+        )
+    if not counts[1] < counts[0]:
+        raise ConfigError(f"--process-index: {counts[1]} of {counts[0]} processes, from 0")
+    return coordinator, counts[0], counts[1]
 
 
 def parse(argv: list[str]) -> Args:
@@ -61,9 +113,9 @@ def parse(argv: list[str]) -> Args:
     if known.resume and known.run_dir is None and not helping:
         raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
     if known.resume and not helping and known.preset == "auto" and not known.without:
-        from kslc_jax import runner
+        from kslc_jax import run_folder
 
-        base = runner.read_config(known.run_dir)
+        base = run_folder.read_config(known.run_dir)
     else:  # also on resume: the runner names what the stored config has otherwise
         name = known.preset
         if name == "auto":
@@ -72,6 +124,8 @@ def parse(argv: list[str]) -> Args:
     args = tyro.cli(Args, args=argv, default=Args(config=base), description=__doc__)
     if args.resume and args.start_from:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
+    if args.profile < 0:
+        raise ConfigError(f"--profile: {args.profile} train steps; 0 writes no trace")
     config = args.config
     if args.steps is not None:
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=args.steps))
@@ -96,29 +150,49 @@ def main(argv: list[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     runtime.prepare()
     try:
+        join(argv)
         args = parse(argv)
         runtime.require_good_jax()
-        from kslc_jax import runner
-        from kslc_jax.checkpoint import CheckpointError
-        from kslc_jax.logs import Progress
-        from kslc_jax.recovery import NumbersError
+        from kslc_jax import devices
+
+        mesh = devices.pick(args.config, None if args.devices == "auto" else args.devices)
     except (ConfigError, RuntimeError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    return _train(args, mesh)
+
+
+def _train(args: Args, mesh: "Mesh | None") -> int:
+    """The exit code. A process of several whose failure is its own ends at once."""
+    from rich.console import Console
+
+    from kslc_jax import devices, runner
+    from kslc_jax.checkpoint import CheckpointError
+    from kslc_jax.logs import Progress
+    from kslc_jax.recovery import NumbersError
+    from kslc_jax.run_folder import RunError
+
     title, run_dir = headline(args)
-    progress = Progress(args.config)
-    progress.say(f"{title}: {runner.describe(args.config, run_dir)}")
+    progress = Progress(args.config, None if devices.is_first() else Console(quiet=True))
+    progress.say(f"{title}: {runner.describe(args.config, run_dir, mesh)}")
+    how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
     try:
-        runner.train(args.config, run_dir, args.resume, progress, args.start_from)
-    except (ConfigError, runner.RunError, CheckpointError) as error:
+        runner.train(args.config, run_dir, args.resume, progress, **how)
+    except (ConfigError, RunError, CheckpointError, devices.Elsewhere) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except NumbersError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except NumbersError as error:  # all processes meet it
+        if devices.is_first():
+            print(f"error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("interrupted before the state was saved", file=sys.stderr)
-        return 130
+        return devices.leave(130)
+    except Exception:
+        if not devices.several():
+            raise
+        traceback.print_exc()
+        return devices.leave(1)
     return 0
 
 

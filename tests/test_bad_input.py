@@ -117,6 +117,35 @@ class TestTrain:
         assert word in self.refused(run_dir, f"--{word}", "1")
         assert word in self.refused(run_dir, "--physics.engine", word)
 
+    def test_profile_and_devices(self, run_dir):
+        assert "--profile: -1" in self.refused(run_dir, "--profile", -1)
+        assert "--profile" in self.refused(run_dir, "--profile", "few")
+        assert "--devices: 0 of" in self.refused(run_dir, "--devices", 0)
+        assert "--devices: 99 of" in self.refused(run_dir, "--devices", 99)
+        assert "--devices" in self.refused(run_dir, "--devices", "few")
+
+    @pytest.mark.parametrize(
+        "options",
+        [
+            ("--coordinator", "localhost:1234"),
+            ("--coordinator", "localhost:1234", "--processes", 2),
+            ("--coordinator", "localhost:1234", "--process-index", 0),
+            ("--coordinator", "localhost", "--processes", 2, "--process-index", 0),
+            ("--coordinator", "localhost:1234", "--processes", "two", "--process-index", 0),
+            ("--coordinator", "localhost:1234", "--processes", 2, "--process-index", -1),
+            ("--coordinator", "auto", "--processes", 2),
+            ("--processes", 2, "--process-index", 0),
+            ("--process-index", 1),
+        ],
+    )
+    def test_processes_that_do_not_say_who_they_are(self, run_dir, options):
+        assert "--coordinator host:port, --processes N" in self.refused(run_dir, *options)
+
+    def test_processes_that_cannot_be(self, run_dir):
+        where = ("--coordinator", "localhost:1234", "--processes", 2, "--process-index", 2)
+        assert "--process-index: 2 of 2" in self.refused(run_dir, *where)
+        assert "--coordinator: cannot join" in self.refused(run_dir, "--coordinator", "auto")
+
     def test_impossible_folder(self, tmp_path):
         folder = tmp_path / ("x" * 300)
         assert "cannot write" in refused(train.main, "--preset", "debug", "--run-dir", folder)

@@ -130,7 +130,7 @@ def test_parts(tmp_path):
 
 
 @pytest.mark.slow(reason="starts Python four times")
-def test_compile_time_and_memory(tmp_path):
+def test_compile_time_and_memory(tmp_path, capsys):
     path = tmp_path / "numbers.json"
     compile_time.main(compile_time.Args(presets=("debug",), engines=("mujoco",), json=path))
     phases = json.loads(path.read_text())["seconds"]["debug, mujoco"]
@@ -138,11 +138,17 @@ def test_compile_time_and_memory(tmp_path):
     assert phases["warm"].keys() == phases["cold"].keys()
 
     out = tmp_path / "memory.png"
-    memory.main(memory.Args("debug", (16, 4096), (3,), out=out, json=path))
+    memory.main(memory.Args("debug", (16, 4096, 2**28), (3,), out=out, json=path))
     small, large = json.loads(path.read_text())["points"]
     assert large["peak_mib"] > small["peak_mib"] > small["before_mib"] > 50
     assert large["estimated_mib"] > 100 * small["estimated_mib"]
+    for point in (small, large):
+        assert 1 / 1.5 < point["estimated_mib"] / point["planned_mib"] < 1.5
+    said = capsys.readouterr().out
+    assert "[3/3]" in said and "does not fit" in said
     assert out.stat().st_size > 10_000
+    memory.main(memory.Args("debug", (16,), (3,), minutes=0.0))
+    assert "0 minutes are over: 1 points are left out" in capsys.readouterr().out
 
 
 @pytest.mark.slow(reason="compiles MJX, a minute or two on two cores")

@@ -8,9 +8,8 @@ import contextlib
 import dataclasses
 import functools
 import math
-import os
 import re
-import socket
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,8 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from children import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
 
-from kslc_jax import checkpoint, devices, observations, physics, train_step
+from kslc_jax import checkpoint, devices, observations, physics, train, train_step
 from kslc_jax.config import NUM_JOINTS, ConfigError, preset
 
 STEPS = 3
@@ -74,8 +74,17 @@ def learn_together(out, port, index, processes="2"):
     devices.join(f"127.0.0.1:{port}", int(processes), int(index))
     assert jax.device_count() == int(processes) * jax.local_device_count()
     init, step = devices.make(MJX, devices.mesh(MJX))
-    state, metrics = run(step, init(), STEPS)
+    state = init()
+    compiled = step.lower(state).compile()
+    devices.meet()
+    state, metrics = run(compiled, state, STEPS)
     np.savez(out, **numbers((state.learner, metrics)))
+
+
+def command_line(*args):
+    """`python -m kslc_jax.train` with cheap physics."""
+    physics.step = glide
+    sys.exit(train.main(list(args)))
 
 
 def run(step, state, steps):
@@ -88,19 +97,26 @@ def run(step, state, steps):
 # ------------------------------------------------------------------------------------- the parent
 
 
-def command(name, *args, forced):
-    """What starts a child that sees `forced` devices: arguments for subprocess."""
-    flags = f"--xla_force_host_platform_device_count={forced}"
-    return {
-        "args": [sys.executable, __file__, name, *map(str, args)],
-        "env": {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags},
-        "stderr": subprocess.PIPE,
-        "text": True,
-    }
+GLIDE = (__file__, "command_line")
+
+
+def assert_same_training(a, b, tolerance=1e-3):
+    """Two run folders, in all but what the clock says."""
+    assert len(rows(a)) == len(rows(b))
+    for one, other in zip(rows(a), rows(b), strict=True):
+        for name in set(one) - {"seconds", "steps_per_second"}:
+            assert one[name] == pytest.approx(other[name], rel=tolerance, abs=0.1 * tolerance), name
+
+
+def latest(run_dir):
+    """The numbers of the latest checkpoint."""
+    with contextlib.closing(checkpoint.Store(run_dir)) as store:
+        return store.steps()[-1], numbers(store.restore(like(), print))
 
 
 def learnt(folder, engine):
-    done = subprocess.run(**command("learn", folder, engine, forced=4), timeout=500, check=False)
+    how = command(__file__, "learn", folder, engine, forced=4)
+    done = subprocess.run(**how, timeout=500, check=False)
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -198,14 +214,12 @@ def test_four_devices_learn_what_one_learns_with_mjx(stepped):
 @pytest.mark.slow(reason="compiles MJX four times, three minutes on two cores")
 def test_two_processes_learn_what_one_learns(stepped, tmp_path):
     """Two processes on this machine, of two devices each."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     files = [tmp_path / f"{index}.npz" for index in range(2)]
     with contextlib.ExitStack() as both:
         processes = []
         for index, file in enumerate(files):
-            how = command("learn_together", file, port, index, forced=2)
+            how = command(__file__, "learn_together", file, port, index, forced=2)
             processes.append(both.enter_context(subprocess.Popen(**how)))
             both.callback(processes[-1].kill)
         for process in processes:
@@ -213,6 +227,52 @@ def test_two_processes_learn_what_one_learns(stepped, tmp_path):
             assert process.returncode == 0, errors
     assert_close(files[0], files[1], tolerance=0.0)
     assert_close(files[0], stepped / "1.npz")
+
+
+TWO = pytest.mark.slow(reason="compiles the train step in two processes, with cheap physics")
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    """A training of five steps on one device."""
+    run_dir = tmp_path_factory.mktemp("one") / "r"
+    alone(*GLIDE, *DEBUG, "--steps", 5 * MJX.batch_size, "--run-dir", run_dir)
+    return run_dir
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """Three steps of it by two processes of two devices each."""
+    run_dir = tmp_path_factory.mktemp("two") / "r"
+    with contextlib.ExitStack() as stack:
+        ended(started(stack, *GLIDE, *DEBUG, "--steps", 3 * MJX.batch_size, "--run-dir", run_dir))
+    return run_dir
+
+
+@TWO
+def test_two_processes_start_what_one_device_goes_on_with(one, two, tmp_path):
+    """And four devices of one process after that."""
+    run_dir = tmp_path / "r"
+    shutil.copytree(two, run_dir)
+    more = (*GLIDE, "--resume", "--run-dir", run_dir, "--steps")
+    assert "resumed at train step 3" in alone(*more, 4 * MJX.batch_size)
+    said = alone(*more, 5 * MJX.batch_size, devices=4)
+    assert "4 of 4 devices" in said and "resumed at train step 4" in said
+    assert_same_training(run_dir, one)
+
+
+@pytest.mark.slow(reason="compiles MJX in two processes, some minutes on two cores")
+def test_two_processes_train_by_the_command_line_itself(stepped, tmp_path):
+    run_dir, steps = tmp_path / "r", STEPS * MJX.batch_size
+    with contextlib.ExitStack() as stack:
+        ended(started(stack, *TRAIN, *DEBUG, "--steps", steps, "--run-dir", run_dir))
+    step, found = latest(run_dir)
+    assert step == STEPS
+    with np.load(stepped / "1.npz") as expected:
+        for name in expected:
+            if ".params" in name:
+                ours = found[name.replace("[0]", ".learner", 1)]
+                np.testing.assert_allclose(ours, expected[name], rtol=1e-3, atol=1e-4, err_msg=name)
 
 
 @pytest.mark.slow(reason="compiles a second train step")

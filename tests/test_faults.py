@@ -25,7 +25,7 @@ from kslc_jax import (
     physics,
     ppo,
     recovery,
-    runner,
+    run_folder,
     runtime,
     train,
     train_step,
@@ -598,7 +598,7 @@ class TestNoPickle:
 
 class TestLock:
     def test_names_the_process(self, tmp_path, capsys):
-        with runner.locked(tmp_path):
+        with run_folder.locked(tmp_path):
             assert train.main(["--preset", "debug", "--run-dir", str(tmp_path)]) == 2
         line = the_error(capsys)
         assert line == f"error: {tmp_path} is in use by another process, id {os.getpid()}"
@@ -606,17 +606,20 @@ class TestLock:
 
     def test_death_releases(self, tmp_path):
         code = (
-            "import time; from pathlib import Path; from kslc_jax import runner\n"
-            f"with runner.locked(Path({str(tmp_path)!r})):\n"
+            "import time; from pathlib import Path; from kslc_jax import run_folder\n"
+            f"with run_folder.locked(Path({str(tmp_path)!r})):\n"
             "    print('locked', flush=True); time.sleep(99)"
         )
         process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
         assert process.stdout.readline() == "locked\n"
-        with pytest.raises(runner.RunError, match=f"id {process.pid}"), runner.locked(tmp_path):
+        with (
+            pytest.raises(run_folder.RunError, match=f"id {process.pid}"),
+            run_folder.locked(tmp_path),
+        ):
             pass
         process.kill()
         process.wait()
-        with runner.locked(tmp_path):
+        with run_folder.locked(tmp_path):
             assert (tmp_path / ".lock").read_text() == str(os.getpid())
 
 

@@ -3,9 +3,11 @@
 import contextlib
 import ctypes.util
 import dataclasses
+import gzip
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -21,7 +23,7 @@ import pytest
 from rich.console import Console
 
 import kslc_jax
-from kslc_jax import checkpoint, learning, runner, train, train_step
+from kslc_jax import checkpoint, disk, keeper, learning, run_folder, runner, train, train_step
 from kslc_jax.config import ConfigError, preset
 from kslc_jax.logs import MetricsFile, Progress
 
@@ -47,7 +49,7 @@ def numbers(rows):
 
 
 def restored(run_dir: Path):
-    config = runner.read_config(run_dir)
+    config = run_folder.read_config(run_dir)
     like = jax.eval_shape(train_step.make(config)[0])
     store = checkpoint.Store(run_dir)
     state = store.restore(like, print)
@@ -74,12 +76,18 @@ def test_run_folder_and_output(whole):
         "snapshots",
         "tensorboard",
     } <= {p.name for p in run_dir.iterdir()}
-    assert runner.read_config(run_dir) == preset("debug")
+    assert run_folder.read_config(run_dir) == preset("debug")
     versions = json.loads((run_dir / "versions.json").read_text())
     assert versions["jax"] == jax.__version__ and "git" in versions
     rows = records(run_dir)
     assert [r["step"] for r in rows] == list(range(1, 9))
     assert rows[-1]["env_steps"] == 1024
+
+
+def test_memory_is_reckoned_before_and_read_off_after_compiling(whole):
+    about = re.search(r"about ([\d.]+) MiB of memory", whole[1])
+    needs = re.search(r"compiled in \d+ s, needs ([\d.]+) MiB; training", whole[1])
+    assert 1 / 1.5 < float(about[1]) / float(needs[1]) < 1.5
 
 
 def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
@@ -92,6 +100,23 @@ def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             x, y = jax.random.key_data(x), jax.random.key_data(y)
         np.testing.assert_array_equal(x, y)
+
+
+def test_profile_changes_no_number(whole, tmp_path):
+    """Two train steps are traced, from the second on; a run that ends before writes what it has."""
+    run_dir = tmp_path / "r"
+    out = cli(*DEBUG, "--run-dir", run_dir, "--profile", 2)
+    assert f"profile of 2 train steps in {run_dir / 'profile'}" in out and "perfetto" in out
+    assert numbers(records(run_dir)) == numbers(records(whole[0]))
+    (traced,) = (run_dir / "profile").rglob("*.trace.json.gz")
+    events = json.loads(gzip.decompress(traced.read_bytes()))["traceEvents"]
+    steps = [e["args"]["step_num"] for e in events if e.get("name") == "train"]
+    assert sorted(map(int, steps)) == [2, 3]
+    assert len(list(traced.parent.glob("*.xplane.pb"))) == 1
+    out = cli("--resume", "--run-dir", run_dir, "--steps", 1152, "--profile", 5)
+    assert "warning: the training ended before there was a train step to profile" in out
+    out = cli("--resume", "--run-dir", run_dir, "--steps", 1536, "--profile", 5)
+    assert "profile of 2 train steps" in out
 
 
 def wait_for(path: Path, lines: int, process):
@@ -156,7 +181,8 @@ def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
     old = kslc_jax.load_policy(whole[0])
     old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
     checkpoint.save_policy(old, tmp_path / "p")
-    begin, origin = runner._starting_from(tmp_path / "p", train_step.make(preset("debug"))[0])
+    init, _ = train_step.make(preset("debug"))
+    begin, origin = runner._starting_from(tmp_path / "p", init, disk.Disk(), None)
     state = begin()
     for a, b in zip(
         jax.tree.leaves(state.learner.params), jax.tree.leaves(old.params), strict=True
@@ -222,7 +248,7 @@ def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
 def test_snapshots_are_spread_over_the_run(parts, due):
     config = preset("debug")
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, snapshots=parts))
-    assert [s for s in range(1, 9) if runner.snapshot_due(config, s)] == due
+    assert [s for s in range(1, 9) if keeper.snapshot_due(config, s)] == due
 
 
 @pytest.mark.slow(reason="compiles, simulates and draws in software, half a minute")
@@ -323,7 +349,7 @@ class TestErrors:
 
     def test_folder_in_use(self, whole, tmp_path, fails):
         shutil.copytree(whole[0], tmp_path / "r")
-        with runner.locked(tmp_path / "r"):
+        with run_folder.locked(tmp_path / "r"):
             assert "in use" in fails("--resume", "--run-dir", tmp_path / "r", "--steps", "2048")
 
     @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -372,12 +398,12 @@ def test_a_longer_run_is_remembered(whole, tmp_path):
     """What is stopped after --resume --steps goes on to the same end without --steps."""
     shutil.copytree(whole[0], tmp_path / "r")
     cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1152)
-    assert runner.read_config(tmp_path / "r").run.steps == 1152
+    assert run_folder.read_config(tmp_path / "r").run.steps == 1152
 
 
 def test_git_is_not_needed(monkeypatch):
     monkeypatch.setenv("PATH", "")
-    assert runner.versions()["git"] == "unknown"
+    assert run_folder.versions()["git"] == "unknown"
 
 
 def test_every_field_can_be_overridden():
@@ -394,8 +420,8 @@ def test_resume_difference_names_the_first_field():
     a = preset("debug")
     b = dataclasses.replace(a, gait=dataclasses.replace(a.gait, cycle_time=0.5))
     with pytest.raises(ConfigError, match=r"gait\.cycle_time is 0\.64.*not 0\.5"):
-        runner.difference(a, b)
-    runner.difference(a, dataclasses.replace(a, run=dataclasses.replace(a.run, steps=9)))
+        run_folder.difference(a, b)
+    run_folder.difference(a, dataclasses.replace(a, run=dataclasses.replace(a.run, steps=9)))
 
 
 def test_metrics_behind_the_checkpoint_are_dropped(tmp_path):

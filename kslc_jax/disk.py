@@ -1,0 +1,155 @@
+"""Who reads and writes checkpoints: this process, or, of several, a child of the first.
+
+Orbax is part of JAX's cluster: each save and each restore waits for all processes in it, and where
+one fails alone the others wait for ever. So of several processes the first lets a child do it that
+belongs to no cluster. What passes between the two is numbers on the host.
+"""
+
+import contextlib
+import dataclasses
+import multiprocessing
+import signal
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+
+from kslc_jax import checkpoint, devices, runtime, train_step
+from kslc_jax.checkpoint import CheckpointError, Policy, Store, first_line, host_array
+from kslc_jax.config import Config
+from kslc_jax.train_step import TrainState
+
+
+class Saves(Protocol):
+    """What a `Store` does for a training."""
+
+    def steps(self) -> list[int]: ...
+    def save(self, state: TrainState, config: Config, metrics: dict[str, float]) -> None: ...
+    def wait(self) -> None: ...
+    def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState: ...
+    def close(self) -> None: ...
+
+
+class Disk:
+    """This process does it."""
+
+    def open(self, run_dir: Path, config: Config) -> Saves:
+        """The checkpoints of a run folder."""
+        return Store(run_dir, config.run.keep)
+
+    def save_policy(self, policy: Policy, folder: Path) -> None:
+        """As `checkpoint.save_policy`."""
+        checkpoint.save_policy(policy, folder)
+
+    def load_policy(self, path: Path) -> Policy:
+        """As `checkpoint.load_policy`."""
+        return checkpoint.load_policy(path)
+
+    def close(self) -> None:
+        """Lets go."""
+
+
+class DiskProcess(Disk):
+    """A child does it; what it meets is raised here."""
+
+    def __init__(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs,))
+        self._process.start()
+        theirs.close()
+
+    def open(self, run_dir: Path, config: Config) -> Saves:
+        self._ask("open", run_dir, config)
+        return self
+
+    def steps(self) -> list[int]:
+        """As `Store.steps`, like those below."""
+        return self._ask("steps")
+
+    def save(self, state: TrainState, config: Config, metrics: dict[str, float]) -> None:
+        self._ask("save", jax.tree.map(host_array, state), config, metrics)
+
+    def wait(self) -> None:
+        self._ask("wait")
+
+    def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState:
+        numbers, warnings = self._ask("restore")
+        for warning in warnings:
+            warn(warning)
+        return jax.tree.map(devices.typed, numbers, like)
+
+    def save_policy(self, policy: Policy, folder: Path) -> None:
+        self._ask("save_policy", _on_host(policy), folder)
+
+    def load_policy(self, path: Path) -> Policy:
+        return self._ask("load_policy", path)
+
+    def close(self) -> None:
+        """Waits until the child has written its last save."""
+        self._pipe.close()
+        self._process.join()
+
+    def _ask(self, what: str, *args: Any) -> Any:
+        try:
+            self._pipe.send((what, args))
+            answer, failure = self._pipe.recv()
+        except (OSError, EOFError) as error:
+            raise CheckpointError("the process that saves checkpoints has died") from error
+        if failure is not None:
+            raise CheckpointError(failure)
+        return answer
+
+
+def _on_host(policy: Policy) -> Policy:
+    params, curriculum = jax.tree.map(np.asarray, (policy.params, policy.curriculum))
+    return dataclasses.replace(policy, params=params, curriculum=curriculum)
+
+
+class _Server:
+    """What the child does, by the name of what it is asked for."""
+
+    save_policy = staticmethod(checkpoint.save_policy)
+
+    def open(self, run_dir: Path, config: Config) -> None:
+        self.store = Store(run_dir, config.run.keep)
+        self.like = jax.eval_shape(lambda: train_step.init(config, 0))
+
+    def steps(self) -> list[int]:
+        return self.store.steps()
+
+    def save(self, numbers: TrainState, config: Config, metrics: dict[str, float]) -> None:
+        self.store.save(jax.tree.map(devices.typed, numbers, self.like), config, metrics)
+
+    def wait(self) -> None:
+        self.store.wait()
+
+    def restore(self) -> tuple[TrainState, list[str]]:
+        warnings: list[str] = []
+        state = self.store.restore(self.like, warnings.append)
+        return jax.tree.map(host_array, state), warnings
+
+    def load_policy(self, path: Path) -> Policy:
+        return _on_host(checkpoint.load_policy(path))
+
+
+def _serve(pipe: Connection) -> None:
+    """The child: answers until the other end is closed, be it by the other's death."""
+    runtime.prepare()
+    jax.config.update("jax_platforms", "cpu")  # the accelerator is the training's
+    for number in (signal.SIGINT, signal.SIGTERM):  # a terminal sends them to both
+        signal.signal(number, signal.SIG_IGN)
+    server = _Server()
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            what, args = pipe.recv()
+            try:
+                pipe.send((getattr(server, what)(*args), None))
+            except Exception as error:
+                pipe.send((None, first_line(error)))
+    if hasattr(server, "store"):
+        with contextlib.suppress(CheckpointError):
+            server.store.close()

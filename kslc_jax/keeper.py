@@ -1,0 +1,156 @@
+"""What the host keeps of a training: metrics, checkpoints, and policies on the way.
+
+Of several processes the first alone does; the others have an `Onlooker` in its place, so that the
+loop reads the same.
+"""
+
+import contextlib
+import math
+import shutil
+import time
+from collections.abc import Callable, Generator
+from pathlib import Path
+
+from kslc_jax import checkpoint
+from kslc_jax.checkpoint import BEST_METRIC, CheckpointError, Policy
+from kslc_jax.config import Config
+from kslc_jax.disk import Saves
+from kslc_jax.logs import MetricsFile, Progress
+from kslc_jax.run_folder import writing
+from kslc_jax.train_step import TrainState
+
+Record = dict[str, float]
+
+
+class Onlooker:
+    """Keeps nothing."""
+
+    def at(self, step: int) -> contextlib.AbstractContextManager[None]:
+        """Around a loop that begins after train step `step`."""
+        return contextlib.nullcontext()
+
+    def log(self, metrics: Record, step: int, took: float) -> Record:
+        """Shows and writes the metrics of a train step that took so many seconds."""
+        return metrics
+
+    def has_checkpoints(self) -> bool:
+        """Whether there is one to go back to."""
+        return False
+
+    def restore(self, like: TrainState) -> TrainState:
+        """The latest whole checkpoint; CheckpointError where there is none."""
+        raise NotImplementedError
+
+    def due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return False
+
+    def save(self, state: TrainState, record: Record) -> None:
+        """Writes a checkpoint in the background."""
+
+    def keep_snapshot(self, state: TrainState) -> None:
+        """Saves the policy alone."""
+
+    def drop_snapshots(self, after: int) -> None:
+        """Removes policies of train steps that a training went back behind."""
+
+    def settle(self) -> None:
+        """Blocks until the last save is on disk, or has failed: training goes on."""
+
+    def finish(self, state: TrainState, record: Record) -> None:
+        """Writes the last checkpoint and waits for it."""
+
+
+class Keeper(Onlooker):
+    """Keeps everything of one run folder, and shows it.
+
+    A failed save must not end hours of training: it is told, and the next one tries again. Only
+    the last one raises a CheckpointError.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        run_dir: Path,
+        store: Saves,
+        progress: Progress,
+        save_policy: Callable[[Policy, Path], None] = checkpoint.save_policy,
+    ):
+        self._config, self._run_dir, self._store = config, run_dir, store
+        self._progress, self._save_policy = progress, save_policy
+
+    @contextlib.contextmanager
+    def at(self, step: int) -> Generator[None]:
+        with writing(self._run_dir):
+            self._file = MetricsFile(self._run_dir, step, self._progress.warn)
+        self._begun = time.monotonic() - self._file.seconds_before
+        # The first train step of a new run is saved, so that whatever happens there is a way back.
+        self._saved = time.monotonic() if self._store.steps() else -math.inf
+        with contextlib.closing(self._file):
+            yield
+
+    def log(self, metrics: Record, step: int, took: float) -> Record:
+        batch = self._config.batch_size
+        record = metrics | {
+            "step": step,
+            "env_steps": step * batch,
+            "seconds": time.monotonic() - self._begun,
+            "steps_per_second": batch / took,
+            BEST_METRIC: metrics["curriculum/v_max"] + metrics["curriculum/tracking"],
+        }
+        if step % self._config.run.log_every == 0:
+            self._file.write(record)
+        self._progress.show(record)
+        return record
+
+    def has_checkpoints(self) -> bool:
+        return bool(self._store.steps())
+
+    def restore(self, like: TrainState) -> TrainState:
+        return self._store.restore(like, self._progress.warn)
+
+    def due(self) -> bool:
+        return time.monotonic() - self._saved > 60.0 * self._config.run.checkpoint_minutes
+
+    def save(self, state: TrainState, record: Record) -> None:
+        self.settle()
+        with self._going_on():
+            self._store.save(state, self._config, record)
+        if math.isinf(self._saved):
+            self.settle()
+        self._saved = time.monotonic()
+
+    def keep_snapshot(self, state: TrainState) -> None:
+        """One that is there, from before a resume, stays."""
+        folder = self._run_dir / checkpoint.SNAPSHOTS / str(int(state.step))
+        with self._going_on():
+            if not folder.exists():
+                self._save_policy(checkpoint.policy_of(self._config, state), folder)
+
+    def drop_snapshots(self, after: int) -> None:
+        for folder in (self._run_dir / checkpoint.SNAPSHOTS).glob("[0-9]*"):
+            if folder.name.isdigit() and int(folder.name) > after:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def settle(self) -> None:
+        with self._going_on():
+            self._store.wait()
+
+    def finish(self, state: TrainState, record: Record) -> None:
+        self.settle()
+        self._store.save(state, self._config, record)
+        self._store.wait()
+
+    @contextlib.contextmanager
+    def _going_on(self) -> Generator[None]:
+        """Says that a save has failed."""
+        try:
+            yield
+        except CheckpointError as error:
+            self._progress.warn(f"{error}; training goes on")
+
+
+def snapshot_due(config: Config, step: int) -> bool:
+    """Whether one of `run.snapshots` equal parts of the run ends with this train step."""
+    parts, steps = config.run.snapshots, config.num_updates
+    return step * parts // steps > (step - 1) * parts // steps

@@ -1,0 +1,75 @@
+"""Trainings in processes of their own, which see as many CPU devices as they are told."""
+
+import contextlib
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+DEBUG = ("--preset", "debug", "--physics.engine", "mjx")
+
+TRAIN = ("-m", "kslc_jax.train")
+
+
+def command(*args: Any, forced: int) -> dict[str, Any]:
+    """Arguments of subprocess for a Python that sees `forced` devices."""
+    flags = f"--xla_force_host_platform_device_count={forced}"
+    return {
+        "args": [sys.executable, *map(str, args)],
+        "env": {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags},
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def started(stack: contextlib.ExitStack, *args: Any, processes: int = 2, forced: int = 2) -> list:
+    """Processes of one training, of `forced` devices each; killed with the stack's end."""
+    options = ["--coordinator", f"127.0.0.1:{free_port()}", "--processes", processes]
+    options += ["--devices", forced, "--process-index"]
+    children = []
+    for index in range(processes):
+        child = subprocess.Popen(**command(*args, *options, index, forced=forced))
+        children.append(stack.enter_context(child))
+        stack.callback(child.kill)
+    return children
+
+
+def ended(children: list, code: int = 0, within: float = 5000.0) -> list[tuple[str, str]]:
+    """What they say on (stdout, stderr), once all have ended with this exit code; without what
+    XLA's way between CPUs prints."""
+    said = [child.communicate(timeout=within) for child in children]
+    assert [child.returncode for child in children] == [code] * len(children), said
+    return [(re.sub(r"(?m)^\[Gloo\].*\n", "", out), err) for out, err in said]
+
+
+def alone(*args: Any, devices: int = 1) -> str:
+    """What one process says that has ended well."""
+    how = command(*args, "--devices", devices, forced=devices)
+    done = subprocess.run(**how, timeout=5000, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def rows(run_dir: Path) -> list[dict[str, float]]:
+    return [json.loads(row) for row in (run_dir / "metrics.jsonl").read_text().splitlines()]
+
+
+def wait_for_rows(run_dir: Path, count: int, children: list) -> None:
+    for _ in range(50000):
+        if (run_dir / "metrics.jsonl").exists() and len(rows(run_dir)) >= count:
+            return
+        assert all(child.poll() is None for child in children), children[0].communicate()
+        time.sleep(0.1)
+    raise AssertionError("no progress")

@@ -1,0 +1,73 @@
+"""What a training is reckoned to take, in numbers worked out by hand."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from kslc_jax import memory, train_step
+from kslc_jax.config import Config, ConfigError, preset
+
+PAPER = preset("paper")
+
+
+def like(config: Config):
+    return jax.eval_shape(lambda: train_step.init(config, 0))
+
+
+def test_update_of_the_debug_preset(debug):
+    """16 environments x 8 steps, 3 and 3 frames, minibatches of 64, 96 hidden units, symmetric."""
+    frames = 16 * ((8 + 2) * 59 + (8 + 2) * 89)
+    samples = 128 * (16 + 16 + 6)
+    minibatch = 64 * (2 * 3 * (59 + 89) + 3 * 96)
+    assert memory._update(debug, 1) == 4 * (frames + samples + minibatch) == 415_232
+
+
+def test_update_of_the_paper_preset():
+    """4096 environments x 60 steps, 15 and 3 frames, minibatches of 61440, 2048 hidden units."""
+    frames = 4096 * ((60 + 14) * 59 + (60 + 2) * 89)
+    samples = 245_760 * 38
+    minibatch = 61_440 * (15 * 59 + 3 * 89 + 3 * 2048)
+    assert memory._update(PAPER, 1) == 4 * (frames + samples + minibatch)
+    assert memory._update(PAPER, 4) == 4 * (frames + samples + minibatch / 4)
+
+
+def test_rollout():
+    """Where there are many environments and few steps, the control step is what counts."""
+    physics = dataclasses.replace(PAPER.physics, engine="mjx")
+    mjx = dataclasses.replace(PAPER, physics=physics)
+    mujoco = dataclasses.replace(PAPER, physics=dataclasses.replace(PAPER.physics, engine="mujoco"))
+    terms = len(dataclasses.fields(PAPER.rewards.weights))
+    trajectory = 4 * 4096 * 60 * (59 + 89 + 38 + terms)
+    assert memory._rollout(mujoco, 1e6, 1) == trajectory + 3e6
+    assert memory._rollout(mjx, 1e6, 1) == trajectory + 3e6 + 4096 * 25 * 1024
+    assert memory._rollout(mjx, 1e6, 4) == trajectory / 4 + 3e6 + 1024 * 25 * 1024
+
+
+def test_the_paper_preset_fits_a_gpu_of_15_gb():
+    need = memory.estimate(PAPER, like(PAPER))
+    assert 1.5e9 < need < 3e9
+    assert memory.estimate(PAPER, like(PAPER), devices=4) < 0.5 * need
+
+
+def test_what_cannot_fit_is_refused(monkeypatch):
+    class Device:
+        device_kind = "a small GPU"
+
+        def memory_stats(self):
+            return {"bytes_limit": 2 * 2**30}
+
+    monkeypatch.setattr(jax, "local_devices", lambda: [Device()])
+    memory.check(PAPER, like(PAPER))
+    large = dataclasses.replace(PAPER, env=dataclasses.replace(PAPER.env, num_envs=8192))
+    with pytest.raises(
+        ConfigError, match=r"env\.num_envs.* need about 3\.8 GiB; a small GPU has 2"
+    ):
+        memory.check(large, like(large))
+
+
+def test_words():
+    assert memory.shown(0.51 * 2**20) == "0.5 MiB"
+    assert memory.shown(233 * 2**20) == "233 MiB"
+    assert memory.shown(1.91 * 2**30) == "1.9 GiB"
+    assert memory.measured(object()) is None
