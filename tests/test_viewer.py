@@ -376,7 +376,8 @@ def test_the_page(run_dir):
             page.on("pageerror", lambda error: errors.append(str(error)))
             page.goto(f"http://127.0.0.1:{made.server.get_port()}")
             page.get_by_text("commanded, ").wait_for()
-            vx = page.locator("input:visible").first
+            # While it connects, viser shows its own address in a field of text.
+            vx = page.locator("input[inputmode=decimal]:visible").first
             vx.fill("0.75")
             vx.press("Enter")
             page.get_by_text("of 0.75 commanded").wait_for()
