@@ -154,7 +154,12 @@ def _home_sensordata(config: PhysicsConfig) -> np.ndarray:
 @functools.lru_cache(maxsize=8)
 def _mjx_model(config: PhysicsConfig) -> mjx.Model:
     with jax.ensure_compile_time_eval():
-        return mjx.put_model(robot_for(config).mj_model, impl="jax")
+        return mjx.put_model(robot_for(config).mj_model, device=_own_device(), impl="jax")
+
+
+def _own_device() -> jax.Device:
+    """MJX would take the first device of all processes, which may be another one's."""
+    return jax.local_devices()[0]
 
 
 def _step_mjx(
@@ -166,7 +171,7 @@ def _step_mjx(
 ) -> PhysicsState:
     robot = robot_for(config)
     model = _mjx_model(config).replace(**fields)
-    data = mjx.make_data(robot.mj_model, impl="jax").replace(
+    data = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax").replace(
         qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
     )
 

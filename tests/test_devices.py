@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from children import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
 
-from kslc_jax import checkpoint, devices, observations, physics, train, train_step
+from kslc_jax import checkpoint, devices, env, observations, physics, train, train_step
 from kslc_jax.config import NUM_JOINTS, ConfigError, preset
 
 STEPS = 3
@@ -47,7 +47,7 @@ def learn(folder, engine):
     """Trains on 1 and on 4 devices, and takes each other's last but one checkpoint to its end."""
     folder = Path(folder)
     if engine == "glide":
-        physics.step = glide
+        env.step = functools.partial(env.step, simulate=glide)
     meshes = {count: devices.mesh(MJX, jax.devices()[:count]) for count in (1, 4)}
     steps = {}
     for count, mesh in meshes.items():
@@ -83,7 +83,7 @@ def learn_together(out, port, index, processes="2"):
 
 def command_line(*args):
     """`python -m kslc_jax.train` with cheap physics."""
-    physics.step = glide
+    env.step = functools.partial(env.step, simulate=glide)
     sys.exit(train.main(list(args)))
 
 
