@@ -5,6 +5,7 @@ what our environment does, in this one's favour: no domain randomisation, no pus
 the reward terms. It exists to be timed; nobody trains with it.
 """
 
+import copy
 import math
 from typing import Any
 
@@ -38,7 +39,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
             config.physics.iterations,
             config.physics.ls_iterations,
         )
-        self.model = self.robot.mj_model
+        self.model = copy.copy(self.robot.mj_model)  # its servos change at every step
         self.data = mujoco.MjData(self.model)
         self.rng = np.random.default_rng(seed)
         shapes = {
@@ -102,7 +103,9 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         for _ in range(self.config.physics.decimation):
             q, dq = data.qpos[7:], data.qvel[6:]
             self.torque = physics.motor_torque(self.robot, motors, q, dq, target, np)
-            data.ctrl[:] = physics.servo_control(self.robot, self.torque, q, dq)
+            damping = physics.motor_damping(self.robot, motors, q, dq, target, np)
+            data.ctrl[:] = physics.servo_control(self.robot, self.torque, damping, q, dq)
+            self.model.actuator_biasprm[:, physics.SERVO_DAMPING] = -damping
             mujoco.mj_step(self.model, data)
 
     def _read(self) -> None:

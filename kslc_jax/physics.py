@@ -34,6 +34,12 @@ from kslc_jax.robot import Robot
 TORQUE_KNEE = 0.75
 """Share of a joint's speed limit above which its driving torque falls, linearly, to zero."""
 
+SERVO_DAMPING = 2
+"""Where -damping stands in a servo's `actuator_biasprm`."""
+
+LEAST_CHANGE = 0.01
+"""Least change of joint speed [rad/s] over which `motor_damping` takes a chord."""
+
 FRICTION_SPEED = 0.2
 """Joint speed [rad/s] at which Coulomb friction is 76 % grown (tanh keeps it smooth)."""
 
@@ -90,25 +96,42 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
     return xp.clip(pd, lower, upper) - dynamics.joint_friction * xp.tanh(dq / FRICTION_SPEED)
 
 
-def limit_speed(config: PhysicsConfig, robot: Robot, qvel, xp: Any = jnp):
-    """qvel [..., 22] with joint speeds cut at their limits as PhysX does, if the config wants it.
+def motor_damping(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
+    """How `motor_torque` falls with joint speed over the coming physics step [16, N m s/rad].
 
-    The motors' law alone cannot hold a light shank at 5 ms: one step of full torque carries it from
-    9 to 16 of its 12 rad/s, and one of braking back to 5.
+    The slope of its chord from the present speed to that at the end of the step. The engines take
+    it implicitly: full torque would carry an unloaded shank by 20 rad/s in 5 ms.
     """
-    if not config.clamp_joint_speed:
-        return qvel
-    joints = xp.clip(qvel[..., 6:], -robot.speed_limit, robot.speed_limit)
-    return xp.concatenate([qvel[..., :6], joints], axis=-1)
+    ahead = _speed_ahead(robot, dynamics, q, dq, target, xp)
+    change = ahead - dq
+    change = xp.where(xp.abs(change) < LEAST_CHANGE, LEAST_CHANGE, change)
+    now, then = (motor_torque(robot, dynamics, q, v, target, xp) for v in (dq, dq + change))
+    return (now - then) / change
 
 
-def servo_control(robot: Robot, torque, q, dq):
-    """Control signal that makes the model's position servos give `torque` at (q, dq).
+def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, xp: Any):
+    """Joint speed [16] after one implicit step, were each joint alone with its inertia.
 
-    The servo's force is kp (ctrl - q) - kd dq; solved for ctrl. Its kd stays in the integrator's
-    implicit part, without which the light foot is unstable at 5 ms.
+    v = dq + rate torque(v), solved for each straight piece of the torque's law. The law falls with
+    v, so that the pieces' solutions are clipped by each other as the pieces are.
     """
-    return q + (torque + robot.kd * dq) / robot.kp
+    rate = robot.mj_model.opt.timestep / robot.joint_inertia
+    gain, kd = dynamics.kp * robot.kp, dynamics.kd * robot.kd
+    full = robot.effort_limit * dynamics.motor_strength
+    slope = full / ((1.0 - TORQUE_KNEE) * robot.speed_limit)
+    slowest, fastest = dq - rate * full, dq + rate * full
+
+    def on_line(torque_at_rest, slope):
+        return (dq + rate * torque_at_rest) / (1.0 + rate * slope)
+
+    upper = xp.clip(on_line(slope * robot.speed_limit, slope), slowest, fastest)
+    lower = xp.clip(on_line(-slope * robot.speed_limit, slope), slowest, fastest)
+    return xp.clip(on_line(gain * (target - q), kd), lower, upper)
+
+
+def servo_control(robot: Robot, torque, damping, q, dq):
+    """Control signal that makes position servos kp (ctrl - q) - damping dq give `torque`."""
+    return q + (torque + damping * dq) / robot.kp
 
 
 def initial_state(config: PhysicsConfig, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
@@ -176,18 +199,19 @@ def _step_mjx(
     )
 
     def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
-        data = data.replace(qvel=limit_speed(config, robot, data.qvel))
         q, dq = data.qpos[7:], data.qvel[6:]
         torque = motor_torque(robot, dynamics, q, dq, target)
-        data = data.replace(ctrl=servo_control(robot, torque, q, dq))
-        return mjx.step(model, data), torque
+        damping = motor_damping(robot, dynamics, q, dq, target)
+        data = data.replace(ctrl=servo_control(robot, torque, damping, q, dq))
+        servos = model.actuator_biasprm.at[:, SERVO_DAMPING].set(-damping)
+        return mjx.step(model.replace(actuator_biasprm=servos), data), torque
 
     with jax.default_matmul_precision("highest"):
         data, torques = jax.lax.scan(substep, data, None, length=config.decimation)
         data = _refresh_sensors(model, data)
     return PhysicsState(
         qpos=data.qpos,
-        qvel=limit_speed(config, robot, data.qvel),
+        qvel=data.qvel,
         qacc_warmstart=data.qacc_warmstart,
         sensordata=data.sensordata,
         torque=torques[-1],
@@ -262,18 +286,20 @@ def _host_step(
             batch.expand(name)[:] = value
         qpos, qvel, warmstart = (batch.bind(n) for n in ("qpos", "qvel", "qacc_warmstart"))
         sensordata, ctrl = batch.bind("sensordata"), batch.bind("ctrl")
+        servos = batch.expand("actuator_biasprm")
         qpos[:], qvel[:], warmstart[:] = state.qpos, state.qvel, state.qacc_warmstart
         torque = state.torque
         for i in range(config.decimation):
-            qvel[:] = limit_speed(config, robot, qvel, np)
             q, dq = qpos[:, 7:], qvel[:, 6:]
             torque = motor_torque(robot, dynamics, q, dq, target, np)
-            ctrl[:] = servo_control(robot, torque, q, dq)
+            damping = motor_damping(robot, dynamics, q, dq, target, np)
+            ctrl[:] = servo_control(robot, torque, damping, q, dq)
+            servos[:, :, SERVO_DAMPING] = -damping
             last = i == config.decimation - 1
             batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
         new = state.replace(
             qpos=qpos,
-            qvel=limit_speed(config, robot, qvel, np),
+            qvel=qvel,
             qacc_warmstart=warmstart,
             sensordata=sensordata,
             torque=torque,

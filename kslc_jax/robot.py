@@ -32,6 +32,7 @@ class Robot:
     kd: np.ndarray  # [16] N m s/rad
     effort_limit: np.ndarray  # [16] N m
     speed_limit: np.ndarray  # [16] rad/s
+    joint_inertia: np.ndarray  # [16] kg m^2, of each joint alone at home in the air
     joint_lower: np.ndarray  # [16] rad
     joint_upper: np.ndarray  # [16] rad
     default_qpos: np.ndarray  # [23] the home keyframe
@@ -100,6 +101,7 @@ def load(
         kd=-model.actuator_biasprm[:, 2],
         effort_limit=model.actuator_forcerange[:, 1].copy(),
         speed_limit=model.numeric("speed_limit").data.copy(),
+        joint_inertia=_joint_inertia(model),
         joint_lower=model.jnt_range[joints, 0],
         joint_upper=model.jnt_range[joints, 1],
         default_qpos=model.keyframe("home").qpos.copy(),
@@ -110,6 +112,15 @@ def load(
         torso_box_half_size=box.size.copy(),
         total_mass=float(model.body_subtreemass[0]),
     )
+
+
+def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
+    mujoco.mj_forward(model, data)
+    inverse = np.zeros((model.nv, model.nv))
+    mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
+    return 1.0 / np.diag(inverse)[6:]
 
 
 def _raise_fidelity(spec: mujoco.MjSpec) -> None:

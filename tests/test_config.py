@@ -201,7 +201,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "randomize.kp": (0.9, 1.1),
         "randomize.kd": (0.9, 1.1),
         "randomize.motor_strength": (0.9, 1.0),
-        "randomize.joint_friction": (0.0, 0.5),
+        "randomize.joint_friction": (0.0, 1.0),
         "randomize.noise": (0.0, 1.0),
         "rewards.base_height_kernel": 30.0,
         "rewards.base_height_drop": 0.0,
@@ -220,7 +220,8 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.weights.tracking_mean_vel": 2.0,
         "rewards.weights.dof_acc": -3e-7,
         "rewards.weights.dof_vel_limits": -5.0,
-        "rewards.weights.stand_still": -0.3,
+        "rewards.weights.stand_still": -1.0,
+        "rewards.weights.tracking_ang_vel": 1.5,
     }
     assert LAPTOP.minibatch_size == 12_288
 

@@ -32,7 +32,7 @@ from kslc_jax.config import ConfigError, PhysicsConfig, preset
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
 ROBOTS = 8
-STEPPED = PhysicsConfig(engine="mujoco", timestep=0.001, decimation=10, clamp_joint_speed=False)
+STEPPED = PhysicsConfig(engine="mujoco", timestep=0.001, decimation=10)
 """The runner's physics: no joint speed is cut, the motors' law alone holds it at 1 ms."""
 
 

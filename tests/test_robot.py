@@ -396,7 +396,7 @@ def test_stands_on_its_feet(fidelity):
     dt, impulse = r.mj_model.opt.timestep, 0.0
     for _ in range(round(0.3 / dt)):
         torque = physics.motor_torque(r, NOMINAL, data.qpos[7:], data.qvel[6:], np.zeros(16), np)
-        data.ctrl[:] = physics.servo_control(r, torque, data.qpos[7:], data.qvel[6:])
+        data.ctrl[:] = physics.servo_control(r, torque, r.kd, data.qpos[7:], data.qvel[6:])
         mujoco.mj_step(r.mj_model, data)
         feet = (data.sensordata[r.sensor(f"{s}_foot_touch")][0] for s in ("left", "right"))
         impulse += dt * sum(feet)

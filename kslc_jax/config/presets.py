@@ -77,7 +77,7 @@ _LAPTOP = _override(
         "kp": (0.9, 1.1),
         "kd": (0.9, 1.1),
         "motor_strength": (0.9, 1.0),
-        "joint_friction": (0.0, 0.5),
+        "joint_friction": (0.0, 1.0),
         "noise": (0.0, 1.0),
     },
     rewards={
@@ -97,9 +97,10 @@ _LAPTOP = _override(
             "tracking_lin_vel": 2.0,
             "track_vel_hard": 0.8,
             "tracking_mean_vel": 2.0,
+            "tracking_ang_vel": 1.5,
             "dof_acc": -3e-7,
             "dof_vel_limits": -5.0,
-            "stand_still": -0.3,
+            "stand_still": -1.0,
         },
     },
 )

@@ -57,8 +57,6 @@ class PhysicsConfig:
     """Newton iterations of the contact solver; below 4 contact explodes on this robot."""
     ls_iterations: int = 5
     """Line-search iterations of the contact solver."""
-    clamp_joint_speed: bool = True
-    """Cuts joint speeds at their limits at every physics step, as PhysX does (HG's engine)."""
     threads: int = 0
     """CPU threads of the mujoco engine; 0 takes all cores. Does not change results."""
 
@@ -86,8 +84,6 @@ class HighFidelity(PhysicsConfig):
     decimation: int = 10
     iterations: int = 100
     ls_iterations: int = 50
-    clamp_joint_speed: bool = False
-    """At 1 ms the motors' own law holds joints to their limits."""
 
     def __post_init__(self):
         super().__post_init__()

@@ -10,7 +10,6 @@ from kslc_jax.config.schema import Config, require
 SCHEMA_VERSION = 1
 
 YOUNGER: dict[str, Any] = {
-    "config.physics.clamp_joint_speed": False,
     "config.network.init_mean": 1.0,
     "config.gait.double_support_at_speed": 0.1,
     "config.gait.stride_sweep": 0.0,
@@ -23,6 +22,9 @@ YOUNGER: dict[str, Any] = {
     "config.run.snapshots": 24,
 }
 """Fields that older files of this version lack, with the values that give the numbers of then."""
+
+RETIRED = {"config.physics.clamp_joint_speed"}
+"""Fields of older files that nothing reads any more."""
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -46,6 +48,7 @@ def _build(cls: Any, data: Any, where: str) -> Any:
     require(isinstance(data, dict), f"{where}: expected an object, got {type(data).__name__}")
     resolved = typing.get_type_hints(cls)
     hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
+    data = {n: value for n, value in data.items() if f"{where}.{n}" not in RETIRED}
     unknown = set(data) - set(hints)
     require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
     absent = set(hints) - set(data)
