@@ -57,10 +57,14 @@ def first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
+def is_key(x: Any) -> bool:
+    """Whether an array, or its shape, is one of typed random keys."""
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
 def host_array(x: jax.Array) -> np.ndarray:
     """An array's numbers on the host; those of a typed key are its key data."""
-    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    return np.asarray(jax.random.key_data(x) if is_key else x)
+    return np.asarray(jax.random.key_data(x) if is_key(x) else x)
 
 
 def checksum(tree: Any) -> int:

@@ -61,8 +61,8 @@ class Args:
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1")
         for name in ("seeds", "ablation_seeds"):
-            if any(not 0 <= seed < config_lib.COUNTER for seed in getattr(self, name)):
-                raise ConfigError(f"{name} must not be negative, nor above 2^31")
+            for seed in getattr(self, name):
+                config_lib.require_seed(seed, name)
         evaluate.check(self.speeds, self.trials, evaluate.Args.seconds)
 
 

@@ -26,7 +26,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
 from kslc_jax import physics, train_step
-from kslc_jax.checkpoint import first_line, host_array
+from kslc_jax.checkpoint import first_line, host_array, is_key
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.train_step import Metrics, TrainState
 
@@ -233,11 +233,6 @@ def _blank(like: Any) -> np.ndarray:
 def typed(numbers: np.ndarray, like: Any) -> Any:
     """An array on the host as what `host_array` made it of: key data become keys again."""
     return jax.random.wrap_key_data(jnp.asarray(numbers)) if is_key(like) else numbers
-
-
-def is_key(x: Any) -> bool:
-    """Whether an array, or its abstract shape, is of typed PRNG keys."""
-    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def whole(state: TrainState) -> TrainState:

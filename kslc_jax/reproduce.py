@@ -59,8 +59,7 @@ class Args:
     """Where the training goes."""
 
     def __post_init__(self):
-        if not 0 <= self.seed < config_lib.COUNTER:
-            raise ConfigError("seed must not be negative, nor above 2^31")
+        config_lib.require_seed(self.seed)
 
 
 def stored(folder: Path, name: str) -> dict[str, Any]:

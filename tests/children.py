@@ -15,6 +15,15 @@ DEBUG = ("--preset", "debug", "--physics.engine", "mjx")
 
 TRAIN = ("-m", "kslc_jax.train")
 
+METRICS = dict.fromkeys(
+    [
+        *("score", "finite", "ppo/skipped", "tracking", "fast_tracking", "episode_steps"),
+        *("curriculum/v_max", "curriculum/cycle_time", "curriculum/tracking"),
+    ],
+    0.5,
+)
+"""As a train step gives them, as far as runner, keeper and progress read them."""
+
 
 def command(*args: Any, forced: int) -> dict[str, Any]:
     """Arguments of subprocess for a Python that sees `forced` devices."""

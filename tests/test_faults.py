@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from children import METRICS
 
 from kslc_jax import (
     checkpoint,
@@ -36,13 +37,6 @@ from kslc_jax.logs import MetricsFile
 
 ROOT = Path(__file__).parents[1]
 DEBUG = preset("debug")
-METRICS = dict.fromkeys(
-    [
-        *("score", "finite", "ppo/skipped", "tracking", "fast_tracking", "episode_steps"),
-        *("curriculum/v_max", "curriculum/cycle_time", "curriculum/tracking"),
-    ],
-    0.5,
-)
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import DEBUG, alone, ended, rows, started, wait_for_rows
+from children import DEBUG, METRICS, alone, ended, rows, started, wait_for_rows
 from jax.sharding import NamedSharding, PartitionSpec
 
 from kslc_jax import checkpoint, devices, recovery, run_folder, train, train_step
@@ -24,21 +24,12 @@ BATCH = preset("debug").batch_size
 
 SLOW = pytest.mark.slow(reason="starts Python four times")
 
-METRICS = dict.fromkeys(
-    [
-        *("ppo/skipped", "tracking", "fast_tracking", "episode_steps"),
-        *("curriculum/v_max", "curriculum/cycle_time", "curriculum/tracking"),
-    ],
-    0.5,
-)
-
-
 # -------------------------------------------------------------------------------- in the children
 
 
 def filled(like):
     """Numbers in an array of `like`'s shape, the first of them -0."""
-    if devices.is_key(like):
+    if checkpoint.is_key(like):
         return jax.random.key(0)
     numbers = np.arange(like.size).reshape(like.shape) % 1000 / 1000
     return jnp.asarray(-numbers if like.ndim else numbers, like.dtype)

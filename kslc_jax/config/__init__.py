@@ -27,6 +27,7 @@ from kslc_jax.config.schema import (
     RewardConfig,
     RewardWeights,
     RunConfig,
+    require_seed,
 )
 from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
 
@@ -53,5 +54,6 @@ __all__ = [
     "RunConfig",
     "from_dict",
     "preset",
+    "require_seed",
     "to_dict",
 ]

@@ -24,6 +24,10 @@ COUNTER = 2**31
 """Steps, samples and seeds are 32-bit integers in the compiled train step."""
 
 
+def require_seed(seed: int, name: str = "seed") -> None:
+    require(0 <= seed < COUNTER, f"{name} must not be negative, nor above 2^31")
+
+
 def _check_numbers(name: str, value: object) -> None:
     """Every number is finite, and every integer one that a shape can hold."""
     if dataclasses.is_dataclass(value):
@@ -469,7 +473,7 @@ class Config:
 
     def __post_init__(self):
         _check_numbers("", self)
-        require(0 <= self.seed < COUNTER, "seed must not be negative, nor above 2^31")
+        require_seed(self.seed)
         for name, seconds in (
             ("env.episode_seconds", self.env.episode_seconds),
             ("command.resample_seconds", self.command.resample_seconds),
