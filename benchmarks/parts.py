@@ -57,8 +57,8 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
         return run_update(state, samples, apply)
 
     def run_update(state, samples, apply):
-        log_std = networks.log_std(config, state.learner.params)
-        return ppo.update(config.ppo, apply, log_std, state.learner, samples, state.key)
+        drawn = train_step.drawn(config, state)
+        return ppo.update(config.ppo, apply, drawn, state.learner, samples, state.key)
 
     def program(fn: Callable, *args: Any) -> Callable[[], Any]:
         jitted = jax.jit(fn)

@@ -44,7 +44,7 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     advantage = ppo._normalise(samples.advantage, samples.valid)
     history, privileged = (x.reshape(-1, *x.shape[2:]) for x in seen)
     stored = (samples.replace(advantage=advantage), history, privileged)
-    learner, losses = _update(config, state.learner, stored, key_update)
+    learner, losses = _update(config, state, stored, key_update)
     progress = train_step._progress(traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
     new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
@@ -52,10 +52,10 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
 
 
 def _update(
-    config: Config, learner: Learner, stored: Stored, key: jax.Array
+    config: Config, state: TrainState, stored: Stored, key: jax.Array
 ) -> tuple[Learner, Metrics]:
     """All epochs: shuffle everything, cut it, one gradient step on each piece."""
-    log_std = networks.log_std(config, learner.params)
+    drawn = train_step.drawn(config, state)
 
     def minibatch(learner: Learner, batch: Stored) -> tuple[Learner, Metrics]:
         samples, history, privileged = batch
@@ -64,7 +64,7 @@ def _update(
             dist = networks.policy(config, params, history)
             return dist, networks.value(config, params, privileged)
 
-        return ppo.gradient_step(config.ppo, apply, log_std, learner, samples)
+        return ppo.gradient_step(config.ppo, apply, drawn, learner, samples)
 
     def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
         order = jax.random.permutation(key, config.batch_size)
@@ -74,5 +74,5 @@ def _update(
         )
         return jax.lax.scan(minibatch, learner, pieces)
 
-    learner, info = jax.lax.scan(epoch, learner, jax.random.split(key, config.ppo.epochs))
+    learner, info = jax.lax.scan(epoch, state.learner, jax.random.split(key, config.ppo.epochs))
     return learner, jax.tree.map(jnp.mean, info)

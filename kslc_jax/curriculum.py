@@ -51,6 +51,12 @@ def is_fast(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.A
     return vx > config.fast_share * state.v_max
 
 
+def left(config: CurriculumConfig, state: Curriculum) -> jax.Array:
+    """Share [] of the way from `v_start` to `v_limit` that is still ahead; 1 if there is none."""
+    way = config.v_limit - config.v_start
+    return (config.v_limit - state.v_max) / way if way > 0.0 else jnp.ones(())
+
+
 def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> Curriculum:
     """Averages `progress` in and, where the gate opens, widens the range and shortens the cycle.
 

@@ -36,6 +36,14 @@ class Samples:
     valid: jax.Array  # [] bool, False: not to be learnt from
 
 
+@flax.struct.dataclass
+class Drawn:
+    """What all samples of a rollout share."""
+
+    log_std: jax.Array  # [16] of the policy that acted
+    entropy_coef: jax.Array  # [] weight of the entropy bonus in their update
+
+
 RELIEF = 1.02
 """Factor on the ceiling of the learning rate per update: a halved one is whole after 36."""
 
@@ -96,12 +104,9 @@ def gae(
 
 
 def loss(
-    config: PPOConfig, apply: Apply, log_std: jax.Array, params: Params, batch: Samples
+    config: PPOConfig, apply: Apply, drawn: Drawn, params: Params, batch: Samples
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate + clipped value loss - entropy bonus, over the valid samples of `batch`.
-
-    `log_std` [16] is the deviation that the batch was sampled with.
-    """
+    """Clipped surrogate + clipped value loss - entropy bonus, over the valid samples of `batch`."""
     dist, value = apply(params, batch.index)
     weight = batch.valid / jnp.maximum(jnp.sum(batch.valid), 1)
 
@@ -117,12 +122,12 @@ def loss(
     value_loss = mean(errors)
 
     entropy = dist.entropy()
-    total = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+    total = policy_loss + config.value_coef * value_loss - drawn.entropy_coef * entropy
     info = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "entropy": entropy,
-        "kl": mean(dist.kl_from(Gaussian(batch.mean, log_std))),
+        "kl": mean(dist.kl_from(Gaussian(batch.mean, drawn.log_std))),
         "clip_share": mean(jnp.abs(ratio - 1.0) > config.clip),
     }
     return total, info
@@ -140,11 +145,11 @@ def adapt_learning_rate(
 
 
 def gradient_step(
-    config: PPOConfig, apply: Apply, log_std: jax.Array, learner: Learner, batch: Samples
+    config: PPOConfig, apply: Apply, drawn: Drawn, learner: Learner, batch: Samples
 ) -> tuple[Learner, dict[str, jax.Array]]:
     """One minibatch. A non-finite gradient changes nothing and is counted in `skipped`."""
     grads, info = jax.grad(loss, argnums=3, has_aux=True)(
-        config, apply, log_std, learner.params, batch
+        config, apply, drawn, learner.params, batch
     )
     grad_norm = optax.tree.norm(grads)
     ceiling = learner.rate_ceiling
@@ -160,15 +165,12 @@ def gradient_step(
 def update(
     config: PPOConfig,
     apply: Apply,
-    log_std: jax.Array,
+    drawn: Drawn,
     learner: Learner,
     samples: Samples,
     key: jax.Array,
 ) -> tuple[Learner, dict[str, jax.Array]]:
-    """All epochs of one rollout's samples [B, ...]: shuffled minibatches, one gradient step each.
-
-    `log_std` [16] is the deviation that the samples were drawn with.
-    """
+    """All epochs of one rollout's samples [B, ...]: shuffled, one gradient step a minibatch."""
     ceiling = jnp.minimum(RELIEF * learner.rate_ceiling, config.learning_rate_bounds[1])
     learner = learner.replace(rate_ceiling=ceiling)
     samples = samples.replace(advantage=_normalise(samples.advantage, samples.valid))
@@ -176,7 +178,7 @@ def update(
 
     def minibatch(learner: Learner, rows: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
         batch = jax.tree.map(lambda x: x[rows], samples)
-        return gradient_step(config, apply, log_std, learner, batch)
+        return gradient_step(config, apply, drawn, learner, batch)
 
     def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
         rows = jax.random.permutation(key, size).reshape(config.minibatches, -1)

@@ -18,7 +18,7 @@ from kslc_jax.config import Config, RunConfig
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Gaussian, Params
-from kslc_jax.ppo import Learner, Samples
+from kslc_jax.ppo import Drawn, Learner, Samples
 
 Metrics = dict[str, jax.Array]
 Spread = Callable[[jax.Array], jax.Array]
@@ -107,12 +107,25 @@ def step(
     last_value = networks.value(config, params, envs.privileged_history)
     samples = _samples(config, traj, last_value)
     apply = _observer(config, start, traj, spread)
-    log_std = networks.log_std(config, params)
-    learner, losses = ppo.update(config.ppo, apply, log_std, state.learner, samples, key_update)
+    learner, losses = ppo.update(
+        config.ppo, apply, drawn(config, state), state.learner, samples, key_update
+    )
     progress = _progress(traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
     new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
     return new, _metrics(config, new, traj.outcome, progress, losses)
+
+
+def drawn(config: Config, state: TrainState) -> Drawn:
+    """What the samples of the coming rollout share.
+
+    With `ppo.entropy_fades` the entropy bonus falls with what is left to climb: a policy that is
+    paid for its noise until the end has learnt to act with it, and is biased without.
+    """
+    coef = jnp.asarray(config.ppo.entropy_coef, jnp.float32)
+    if config.ppo.entropy_fades:
+        coef *= curriculum_lib.left(config.curriculum, state.curriculum)
+    return Drawn(networks.log_std(config, state.learner.params), coef)
 
 
 def step_keys(state: TrainState) -> jax.Array:

@@ -181,6 +181,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
     """docs/fidelity.md, "The laptop preset", gives the reason of each."""
     assert {k: v[1] for k, v in changes(PAPER, LAPTOP).items()} == LEARNER | {
         "network.symmetric": True,
+        "ppo.entropy_fades": True,
         "command.stand_fraction": 0.1,
         "command.forward_fraction": 0.2,
         "command.narrow_speed": 4.0,

@@ -164,3 +164,14 @@ def test_start_average_cannot_open_the_gate_early():
     while float(current.v_max) == 0.5 and n < 200:
         current, n = update(CONFIG, current, progress(0.85, 0.85, 10, 2000.0, 5)), n + 1
     assert n == 56
+
+
+@pytest.mark.parametrize(("v_max", "left"), [(0.5, 1.0), (2.0, 0.5), (3.5, 0.0)])
+def test_what_is_left_of_the_way(v_max, left):
+    """From 0.5 to 3.5 m/s."""
+    assert float(curriculum.left(CONFIG, state(v_max=v_max))) == pytest.approx(left)
+
+
+def test_without_a_way_all_of_it_is_left():
+    config = dataclasses.replace(CONFIG, v_start=3.5)
+    assert float(curriculum.left(config, state(v_max=3.5))) == 1.0

@@ -108,6 +108,9 @@ def test_learning_rate_stays_below_its_ceiling():
     assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(high), slow, 0.1 * low) == pytest.approx(low)
 
 
+DRAWN = ppo.Drawn(log_std=jnp.zeros(1), entropy_coef=jnp.zeros(()))
+
+
 def samples(**changes):
     base = ppo.Samples(
         index=jnp.arange(2),
@@ -134,41 +137,48 @@ def params(mean=0.0, value=0.0):
 
 class TestLoss:
     def loss(self, params, batch):
-        return ppo.loss(CONFIG, bandit_apply, jnp.zeros(1), params, batch)[1]
+        return ppo.loss(CONFIG, bandit_apply, DRAWN, params, batch)
 
     def test_ratio_one(self):
-        info = self.loss(params(), samples())
+        info = self.loss(params(), samples())[1]
         assert info["policy_loss"] == pytest.approx(0.0, abs=1e-6)  # -(1 - 1) / 2
         assert info["kl"] == pytest.approx(0.0, abs=1e-6)
 
     def test_ratio_is_clipped(self):
         # mean 1: ratio = exp(-1/2) = 0.6065; min(0.6065 * 1, 0.8) and min(-0.6065, -0.8)
-        info = self.loss(params(mean=1.0), samples())
+        info = self.loss(params(mean=1.0), samples())[1]
         assert info["policy_loss"] == pytest.approx(-(0.60653 - 0.8) / 2, abs=1e-4)
         assert info["clip_share"] == pytest.approx(1.0)
         assert info["kl"] == pytest.approx(0.5)
 
     def test_value_is_clipped(self):
         # value 1, old 0: clipped to 0.2; max((1-1)^2, 0.8^2) and max(1, 1.8^2), mean
-        info = self.loss(params(value=1.0), samples())
+        info = self.loss(params(value=1.0), samples())[1]
         assert info["value_loss"] == pytest.approx((0.64 + 3.24) / 2)
 
     def test_invalid_samples_do_not_count(self):
         one = samples(valid=jnp.array([True, False]), target=jnp.array([1.0, 1e6]))
-        assert self.loss(params(), one)["value_loss"] == pytest.approx(1.0)
+        assert self.loss(params(), one)[1]["value_loss"] == pytest.approx(1.0)
+
+    def test_entropy_bonus(self):
+        """0.01 x the entropy of N(0, 1), 1.418939."""
+        paid = ppo.loss(
+            CONFIG, bandit_apply, DRAWN.replace(entropy_coef=0.01), params(), samples()
+        )[0]
+        assert self.loss(params(), samples())[0] - paid == pytest.approx(0.01418939, rel=1e-3)
 
 
 def test_non_finite_gradient_changes_nothing_and_is_counted():
     learner = ppo.init(CONFIG, params())
     bad = samples(target=jnp.array([jnp.nan, 1.0]))
-    new, info = ppo.gradient_step(CONFIG, bandit_apply, jnp.zeros(1), learner, bad)
+    new, info = ppo.gradient_step(CONFIG, bandit_apply, DRAWN, learner, bad)
     chex.assert_trees_all_equal(new, learner)
     assert info["skipped"] == 1.0
 
 
 def test_update_finds_the_best_action_of_a_bandit():
     """Reward -(a - 2)^2: the mean moves from 0 to 2, the value to the reward's mean."""
-    config = PPOConfig(learning_rate=1e-2, minibatches=4, epochs=4, entropy_coef=0.0)
+    config = PPOConfig(learning_rate=1e-2, minibatches=4, epochs=4)
     learner = ppo.init(config, params())
 
     @jax.jit
@@ -189,8 +199,8 @@ def test_update_finds_the_best_action_of_a_bandit():
             reward,
             index >= 0,
         )
-        log_std = learner.params["log_std"]
-        return ppo.update(config, bandit_apply, log_std, learner, batch, key_update)[0]
+        drawn = DRAWN.replace(log_std=learner.params["log_std"])
+        return ppo.update(config, bandit_apply, drawn, learner, batch, key_update)[0]
 
     for key in jax.random.split(jax.random.key(0), 150):
         learner = iterate(learner, key)

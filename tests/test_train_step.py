@@ -54,6 +54,18 @@ def test_state_is_donated(made):
     assert leaf.is_deleted()
 
 
+@pytest.mark.parametrize(("fades", "v_max", "coef"), [(True, 3.5, 0.00075), (False, 3.5, 0.003)])
+def test_entropy_bonus_fades_with_the_way_that_is_left(made, fades, v_max, coef):
+    """0.003 at 0.5 m/s, nothing at 4.5: a quarter at 3.5."""
+    config, init, _ = made
+    config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, entropy_fades=fades))
+    state = init()
+    curriculum = state.curriculum.replace(v_max=jnp.asarray(v_max))
+    drawn = train_step.drawn(config, state.replace(curriculum=curriculum))
+    assert float(drawn.entropy_coef) == pytest.approx(coef)
+    np.testing.assert_allclose(jnp.exp(drawn.log_std), config.network.init_std, rtol=1e-6)
+
+
 def test_metrics_are_finite_and_named(made):
     config, init, step = made
     _, metrics = step(init())

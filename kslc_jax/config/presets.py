@@ -50,6 +50,7 @@ _LAPTOP_LEARNER: dict[str, Any] = {
 _LAPTOP = _override(
     _override(_PAPER, **_LAPTOP_LEARNER),
     network={"symmetric": True},
+    ppo={"entropy_fades": True},
     command={
         "stand_fraction": 0.1,
         "forward_fraction": 0.2,

@@ -413,6 +413,8 @@ class PPOConfig:
     clip: float = 0.2
     value_coef: float = 1.0
     entropy_coef: float = 0.001
+    entropy_fades: bool = False
+    """True: the entropy bonus falls to nothing on the curriculum's way to `v_limit`."""
     max_grad_norm: float = 1.0
     learning_rate: float = 1e-5
     """Start of the adaptive schedule (Table I); it rises at once."""

@@ -11,6 +11,7 @@ SCHEMA_VERSION = 1
 
 YOUNGER: dict[str, Any] = {
     "config.network.init_mean": 1.0,
+    "config.ppo.entropy_fades": False,
     "config.gait.double_support_at_speed": 0.1,
     "config.gait.stride_sweep": 0.0,
     "config.rewards.weights.tracking_mean_vel": 0.0,
