@@ -70,11 +70,13 @@ def simulate(controller, model, seconds):
     quat, angvel, q, dq = data.qpos[3:7], data.qvel[3:6], data.qpos[7:], data.qvel[6:]  # views
     q[:], track = m.default_joint_pos, [data.qpos[:3].copy()]
     model.actuator_forcelimited[:] = 0  # the limits are motor_torque's
+    damping = 0.6 * np.array(m.kd)  # implicit, as the package has it where no limit is reached
+    model.actuator_biasprm[:, 2] = -damping
     while len(track) <= round(seconds / m.control_dt) and track[-1][2] > track[0][2] / 2:
         target = controller.targets(quat, angvel, q, dq)
         for _ in range(round(m.control_dt / model.opt.timestep)):
             torque = motor_torque(m, target, q, dq)
-            data.ctrl = q + (torque + m.kd * dq) / m.kp  # the servos give kp (ctrl - q) - kd dq
+            data.ctrl = q + (torque + damping * dq) / m.kp  # servos: kp (ctrl - q) - damping dq
             mujoco.mj_step(model, data)
         track.append(data.qpos[:3].copy())
     return np.array(track)
