@@ -90,8 +90,9 @@ open(sys.argv[1] + ".ready", "w").close()
 time.sleep(60)
 """
     parent = f"""
-import subprocess, sys
+import signal, subprocess, sys
 from kslc_jax import compare
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
 start = subprocess.Popen
 subprocess.Popen = lambda _: start([sys.executable, "-c", {child!r}, {str(tmp_path / "saved")!r}])
 compare.call("train", ())
