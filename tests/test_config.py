@@ -350,6 +350,10 @@ def test_wrong_stored_field_is_named(path, value, message):
         from_dict(edited(path, value))
 
 
+def test_retired_field_of_an_older_file_is_passed_over():
+    assert from_dict(edited("physics.clamp_joint_speed", True)) == PAPER
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [
