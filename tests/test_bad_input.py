@@ -114,7 +114,7 @@ class TestTrain:
     def test_unknown_names(self, run_dir, word):
         assert word in refused(train.main, "--preset", word, "--run-dir", run_dir / "new")
         assert word in self.refused(run_dir, "--without", word)
-        assert word in self.refused(run_dir, f"--{word}", "1")
+        assert word in self.refused(run_dir, f"--of-{word}", "1")  # "--seed" would be one
         assert word in self.refused(run_dir, "--physics.engine", word)
 
     def test_profile_and_devices(self, run_dir):
