@@ -102,8 +102,9 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         data, motors = self.data, NominalMotors
         for _ in range(self.config.physics.decimation):
             q, dq = data.qpos[7:], data.qvel[6:]
-            self.torque = physics.motor_torque(self.robot, motors, q, dq, target, np)
-            damping = physics.motor_damping(self.robot, motors, q, dq, target, np)
+            now = (self.robot, motors, q, dq, target)
+            self.torque = physics.motor_torque(*now, np)
+            damping = physics.motor_damping(*now, self.torque, np)
             data.ctrl[:] = physics.servo_control(self.robot, self.torque, damping, q, dq)
             self.model.actuator_biasprm[:, physics.SERVO_DAMPING] = -damping
             mujoco.mj_step(self.model, data)

@@ -67,6 +67,11 @@ def host_array(x: jax.Array) -> np.ndarray:
     return np.asarray(jax.random.key_data(x) if is_key(x) else x)
 
 
+def typed(numbers: np.ndarray, like: Any) -> Any:
+    """An array on the host as what `host_array` made it of: key data become keys again."""
+    return jax.random.wrap_key_data(jnp.asarray(numbers)) if is_key(like) else numbers
+
+
 def checksum(tree: Any) -> int:
     """CRC-32 of all numbers of a tree: orbax itself reads flipped bits without a word."""
     crc = 0

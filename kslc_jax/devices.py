@@ -19,14 +19,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
 from kslc_jax import physics, train_step
-from kslc_jax.checkpoint import first_line, host_array, is_key
+from kslc_jax.checkpoint import first_line, host_array, is_key, typed
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.train_step import Metrics, TrainState
 
@@ -228,11 +227,6 @@ def _blank(like: Any) -> np.ndarray:
     """Zeros of an array's shape and type, of a typed key's data."""
     like = jax.eval_shape(jax.random.key_data, like) if is_key(like) else like
     return np.zeros(like.shape, like.dtype)
-
-
-def typed(numbers: np.ndarray, like: Any) -> Any:
-    """An array on the host as what `host_array` made it of: key data become keys again."""
-    return jax.random.wrap_key_data(jnp.asarray(numbers)) if is_key(like) else numbers
 
 
 def whole(state: TrainState) -> TrainState:

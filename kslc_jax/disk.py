@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from kslc_jax import checkpoint, devices, runtime, train_step
-from kslc_jax.checkpoint import CheckpointError, Policy, Store, first_line, host_array
+from kslc_jax import checkpoint, runtime, train_step
+from kslc_jax.checkpoint import CheckpointError, Policy, Store, first_line, host_array, typed
 from kslc_jax.config import Config
 from kslc_jax.train_step import TrainState
 
@@ -80,7 +80,7 @@ class DiskProcess(Disk):
         numbers, warnings = self._ask("restore")
         for warning in warnings:
             warn(warning)
-        return jax.tree.map(devices.typed, numbers, like)
+        return jax.tree.map(typed, numbers, like)
 
     def save_policy(self, policy: Policy, folder: Path) -> None:
         self._ask("save_policy", _on_host(policy), folder)
@@ -122,7 +122,7 @@ class _Server:
         return self.store.steps()
 
     def save(self, numbers: TrainState, config: Config, metrics: dict[str, float]) -> None:
-        self.store.save(jax.tree.map(devices.typed, numbers, self.like), config, metrics)
+        self.store.save(jax.tree.map(typed, numbers, self.like), config, metrics)
 
     def wait(self) -> None:
         self.store.wait()

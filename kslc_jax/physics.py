@@ -100,29 +100,29 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
     return xp.clip(pd, lower, upper) - dynamics.joint_friction * xp.tanh(dq / FRICTION_SPEED)
 
 
-def motor_damping(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
-    """How `motor_torque` falls with joint speed over the coming physics step [16, N m s/rad].
+def motor_damping(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any = jnp):
+    """How `motor_torque` falls with joint speed over the coming physics step [16, N m s/rad], from
+    its present `torque`.
 
     The engines take it implicitly: full torque would carry an unloaded shank by 20 rad/s in 5 ms.
     It is `IMPLICIT` times the slope of the chord from the present speed to that at the end of the
     step, so that a joint alone moves by the theta-method.
     """
-    now = motor_torque(robot, dynamics, q, dq, target, xp)
-    change = _speed_ahead(robot, dynamics, q, dq, target, now, xp) - dq
+    change = _speed_ahead(robot, dynamics, q, dq, target, torque, xp) - dq
     change = xp.where(xp.abs(change) < LEAST_CHANGE, LEAST_CHANGE, change)
     then = motor_torque(robot, dynamics, q, dq + change, target, xp)
-    return IMPLICIT * (now - then) / change
+    return IMPLICIT * (torque - then) / change
 
 
-def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, now, xp: Any):
+def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
     """Joint speed [16] at the end of the step, were each joint alone with its inertia.
 
-    v = dq + h / inertia ((1 - theta) now + theta torque(v)), solved for each straight piece of the
-    torque's law. The law falls with v, so that the solutions are clipped by each other as the
+    v = dq + h / inertia ((1 - theta) torque + theta torque(v)), solved for each straight piece of
+    the torque's law. The law falls with v, so that the solutions are clipped by each other as the
     pieces are.
     """
     rate = robot.mj_model.opt.timestep / robot.joint_inertia
-    start, rate = dq + (1.0 - IMPLICIT) * rate * now, IMPLICIT * rate
+    start, rate = dq + (1.0 - IMPLICIT) * rate * torque, IMPLICIT * rate
     gain, kd = dynamics.kp * robot.kp, dynamics.kd * robot.kd
     full = robot.effort_limit * dynamics.motor_strength
     slope = full / ((1.0 - TORQUE_KNEE) * robot.speed_limit)
@@ -208,7 +208,7 @@ def _step_mjx(
     def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
         q, dq = data.qpos[7:], data.qvel[6:]
         torque = motor_torque(robot, dynamics, q, dq, target)
-        damping = motor_damping(robot, dynamics, q, dq, target)
+        damping = motor_damping(robot, dynamics, q, dq, target, torque)
         data = data.replace(ctrl=servo_control(robot, torque, damping, q, dq))
         servos = model.actuator_biasprm.at[:, SERVO_DAMPING].set(-damping)
         return mjx.step(model.replace(actuator_biasprm=servos), data), torque
@@ -299,7 +299,7 @@ def _host_step(
         for i in range(config.decimation):
             q, dq = qpos[:, 7:], qvel[:, 6:]
             torque = motor_torque(robot, dynamics, q, dq, target, np)
-            damping = motor_damping(robot, dynamics, q, dq, target, np)
+            damping = motor_damping(robot, dynamics, q, dq, target, torque, np)
             ctrl[:] = servo_control(robot, torque, damping, q, dq)
             servos[:, :, SERVO_DAMPING] = -damping
             last = i == config.decimation - 1

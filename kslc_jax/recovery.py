@@ -16,7 +16,7 @@ import numpy as np
 
 from kslc_jax import config as config_lib
 from kslc_jax import train_step
-from kslc_jax.checkpoint import CheckpointError, first_line, host_array, is_key
+from kslc_jax.checkpoint import CheckpointError, first_line, host_array, typed
 from kslc_jax.config import Config
 from kslc_jax.train_step import TrainState
 
@@ -149,9 +149,7 @@ def read_dump(path: Path) -> tuple[Config, TrainState]:
 
     def leaf(where: Any, like: jax.Array) -> jax.Array:
         name = jax.tree_util.keystr(where)
-        x = jnp.asarray(arrays[name])
-        if is_key(like):
-            x = jax.random.wrap_key_data(x)
+        x = jnp.asarray(typed(arrays[name], like))
         if (x.shape, x.dtype) != (like.shape, like.dtype):
             raise ValueError(f"{name} is {x.dtype}{x.shape}, not {like.dtype}{like.shape}")
         return x

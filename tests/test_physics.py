@@ -72,10 +72,12 @@ class TestMotorTorque:
         rng = np.random.default_rng(0)
         q, dq, target = rng.normal(size=(3, 16)) * 4
         dyn = randomize.nominal()
-        for function in (physics.motor_torque, physics.motor_damping):
-            a = function(robot.load(), dyn, q, dq, target)
-            b = function(robot.load(), jax.tree.map(np.asarray, dyn), q, dq, target, np)
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+        a = physics.motor_torque(robot.load(), dyn, q, dq, target)
+        b = physics.motor_torque(robot.load(), jax.tree.map(np.asarray, dyn), q, dq, target, np)
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
+        a = physics.motor_damping(robot.load(), dyn, q, dq, target, a)
+        b = physics.motor_damping(robot.load(), dyn, q, dq, target, b, np)
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
 class TestMotorDamping:
@@ -83,7 +85,8 @@ class TestMotorDamping:
         """0.6 of the PD's kd wherever the torque is the PD's at both ends of the step."""
         rng = np.random.default_rng(3)
         q, dq, target = rng.normal(size=(3, 16)) * [[0.05], [0.5], [0.05]]
-        damping = physics.motor_damping(xbot, randomize.nominal(), q, dq, target, np)
+        torque = physics.motor_torque(xbot, randomize.nominal(), q, dq, target, np)
+        damping = physics.motor_damping(xbot, randomize.nominal(), q, dq, target, torque, np)
         np.testing.assert_allclose(damping, 0.6 * xbot.kd, rtol=1e-5)
 
     @pytest.mark.parametrize("dq", [-18.0, -4.0, 0.0, 8.0, 11.0, 18.0])
@@ -103,7 +106,7 @@ class TestMotorDamping:
             mean = 0.4 * torque(dq) + 0.6 * torque(speed)
             below = speed - dq < h / xbot.joint_inertia * mean
             low, high = np.where(below, speed, low), np.where(below, high, speed)
-        damping = physics.motor_damping(xbot, dyn, q, dq, target, np)
+        damping = physics.motor_damping(xbot, dyn, q, dq, target, torque(dq), np)
         change = h * torque(dq) / (xbot.joint_inertia + h * damping)
         np.testing.assert_allclose(dq + change, speed, atol=0.02)
         assert np.all(damping > -1e-6)

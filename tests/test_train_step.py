@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import networks, train_step
+from kslc_jax import checkpoint, networks, train_step
 from kslc_jax.config import preset
 
 
@@ -21,8 +21,7 @@ def made():
 
 def leaves(state):
     """All leaves as numpy; keys as their data."""
-    is_key = lambda x: jnp.issubdtype(x.dtype, jax.dtypes.prng_key)  # noqa: E731
-    return [np.asarray(jax.random.key_data(x) if is_key(x) else x) for x in jax.tree.leaves(state)]
+    return [checkpoint.host_array(x) for x in jax.tree.leaves(state)]
 
 
 def assert_same(a, b):
