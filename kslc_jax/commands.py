@@ -23,12 +23,15 @@ class Command:
 def sample(
     config: CommandConfig, key: jax.Array, vx_range: tuple[jax.Array, jax.Array], yaw: jax.Array
 ) -> Command:
-    """Draws a command for a robot that now heads to `yaw` [rad]; vx is uniform in `vx_range`.
+    """Draws a command for a robot that now heads to `yaw` [rad]; vx is uniform in `vx_range`,
+    for the `slow_fraction` in its part up to `slow_speed`.
 
     Fast commands come with small side steps and turns: with `narrow_speed` both shrink linearly.
     """
-    keys = jax.random.split(key, 4)
-    vx = jax.random.uniform(keys[0], minval=vx_range[0], maxval=vx_range[1])
+    keys = jax.random.split(key, 5)
+    slow = jax.random.bernoulli(keys[4], config.slow_fraction)
+    top = jnp.where(slow, jnp.clip(config.slow_speed, *vx_range), vx_range[1])
+    vx = jax.random.uniform(keys[0], minval=vx_range[0], maxval=top)
     vy = jax.random.uniform(keys[1], minval=config.vy[0], maxval=config.vy[1])
     heading = jax.random.uniform(keys[2], minval=config.heading[0], maxval=config.heading[1])
     if config.narrow_speed > 0:

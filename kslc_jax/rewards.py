@@ -217,9 +217,13 @@ def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Joint motion and distance from the default pose while the command is to stand (ours)."""
+    """Motion, distance from the default pose and restless actions while asked to stand (ours).
+
+    The actions' changes count squared: exploration then adds the same to all of them, and hides
+    nothing of how the policy itself trembles."""
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
-    return jnp.where(x.command.moving, 0.0, moved)
+    restless = 0.5 * jnp.sum(jnp.square(x.action - x.last_action))
+    return jnp.where(x.command.moving, 0.0, moved + restless)
 
 
 # ------------------------------------------------------------------------------------- HG: effort

@@ -122,6 +122,30 @@ def test_forward_commands_keep_the_heading():
 
 
 @pytest.mark.parametrize(
+    ("vx", "mean", "most"),
+    [
+        ((-0.3, 3.5), 0.35, 1.0),
+        ((-0.3, 0.5), 0.1, 0.5),  # the whole range is slow
+        ((1.5, 3.5), 1.5, 1.5),  # none of it
+    ],
+)
+def test_slow_commands(vx, mean, most):
+    """Uniform from the range's lower end to `slow_speed`, within the range."""
+    config = dataclasses.replace(PAPER, dead_zone=0.0, slow_fraction=1.0, slow_speed=1.0)
+    speeds = np.asarray(draw_many(config, vx=vx).velocity[:, 0])
+    assert speeds.mean() == pytest.approx(mean, abs=0.02)
+    assert speeds.min() == pytest.approx(vx[0], abs=0.01)
+    assert speeds.max() == pytest.approx(most, abs=0.01)
+
+
+def test_a_share_of_the_commands_is_slow():
+    """A quarter of them, beside the 1.3 of 3.8 m/s that are slow anyway: 0.507."""
+    config = dataclasses.replace(PAPER, dead_zone=0.0, slow_fraction=0.25, slow_speed=1.0)
+    speeds = np.asarray(draw_many(config).velocity[:, 0])
+    assert (speeds < 1.0).mean() == pytest.approx(0.25 + 0.75 * 1.3 / 3.8, abs=0.03)
+
+
+@pytest.mark.parametrize(
     ("velocity", "moving", "left"),
     [
         ([1.0, 0.0, 0.0], True, [1.0, 0.0, 0.0]),

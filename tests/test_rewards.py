@@ -370,7 +370,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ),
     ("collision", KSLC, {}, 0.0),
     ("collision", KSLC, {"torso_contact": True}, 1.0),
-    # 0.5 + 0.1 * 2.
+    # 0.5 + 0.1 * 2 + 0.5 * (0.6^2 + 0.8^2).
     (
         "stand_still",
         KSLC,
@@ -378,10 +378,20 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
             "moving": False,
             "joint_pos": joints(left_knee=0.3, right_knee=0.4),
             "joint_vel": joints(left_knee=2.0),
+            "action": joints(left_knee=0.1, right_knee=-0.8),
+            "last_action": joints(left_knee=0.7),
         },
-        0.7,
+        1.2,
     ),
-    ("stand_still", KSLC, {"joint_pos": joints(left_knee=0.3, right_knee=0.4)}, 0.0),
+    (
+        "stand_still",
+        KSLC,
+        {
+            "joint_pos": joints(left_knee=0.3, right_knee=0.4),
+            "action": joints(left_knee=1.0),
+        },
+        0.0,
+    ),
     # 1 <- 0.5 <- 0.2: 0.5^2 + (1 + 0.2 - 1)^2 + 0.05; a constant -2: 0.05 * 2.
     (
         "action_smoothness",

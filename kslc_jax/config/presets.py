@@ -54,6 +54,7 @@ _LAPTOP = _override(
     command={
         "stand_fraction": 0.1,
         "forward_fraction": 0.2,
+        "slow_fraction": 0.15,
         "narrow_speed": 4.0,
         "stand_still": True,
     },

@@ -146,6 +146,11 @@ class CommandConfig:
     """Share of commands that are 'stand still'."""
     forward_fraction: float = 0.0
     """Share of commands that are straight ahead (no vy, heading as it is)."""
+    slow_fraction: float = 0.0
+    """Share of commands whose vx is drawn up to `slow_speed` only: in a wide range slow commands
+    are rare."""
+    slow_speed: float = 1.0
+    """Fastest of those [m/s]."""
     narrow_speed: float = 0.0
     """Forward speed [m/s] at which vy and heading changes have shrunk to nothing; 0: never."""
     stand_still: bool = False
@@ -159,6 +164,8 @@ class CommandConfig:
             0 <= self.stand_fraction + self.forward_fraction <= 1,
             "command.stand_fraction + command.forward_fraction must lie in [0, 1]",
         )
+        require(0 <= self.slow_fraction <= 1, "command.slow_fraction must lie in [0, 1]")
+        require(self.slow_speed > 0, "command.slow_speed must be positive")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from kslc_jax.config.schema import Config, require
 SCHEMA_VERSION = 1
 
 YOUNGER: dict[str, Any] = {
+    "config.command.slow_fraction": 0.0,
+    "config.command.slow_speed": 1.0,
     "config.network.init_mean": 1.0,
     "config.ppo.entropy_fades": False,
     "config.gait.double_support_at_speed": 0.1,
