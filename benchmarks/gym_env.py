@@ -99,14 +99,11 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
 
     def simulate(self, target: np.ndarray) -> None:
         """One control step of the physics towards the joint targets [16, rad]."""
-        data, motors = self.data, NominalMotors
+        data, servos = self.data, self.model.actuator_biasprm
         for _ in range(self.config.physics.decimation):
-            q, dq = data.qpos[7:], data.qvel[6:]
-            now = (self.robot, motors, q, dq, target)
-            self.torque = physics.motor_torque(*now, np)
-            damping = physics.motor_damping(*now, self.torque, np)
-            data.ctrl[:] = physics.servo_control(self.robot, self.torque, damping, q, dq)
-            self.model.actuator_biasprm[:, physics.SERVO_DAMPING] = -damping
+            self.torque, data.ctrl[:], servos[:, physics.SERVO_DAMPING] = physics.drive(
+                self.robot, NominalMotors, data.qpos[7:], data.qvel[6:], target, np
+            )
             mujoco.mj_step(self.model, data)
 
     def _read(self) -> None:

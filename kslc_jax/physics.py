@@ -141,6 +141,16 @@ def servo_control(robot: Robot, torque, damping, q, dq):
     return q + (torque + damping * dq) / robot.kp
 
 
+def drive(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
+    """(motor torque, servos' control, servos' bias on joint speed) of one physics step, [..., 16].
+
+    The last one belongs to `actuator_biasprm[..., SERVO_DAMPING]`.
+    """
+    torque = motor_torque(robot, dynamics, q, dq, target, xp)
+    damping = motor_damping(robot, dynamics, q, dq, target, torque, xp)
+    return torque, servo_control(robot, torque, damping, q, dq), -damping
+
+
 def initial_state(config: PhysicsConfig, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
     """State before any step; sensors hold the home pose's values until the first step."""
     model = robot_for(config).mj_model
@@ -206,12 +216,9 @@ def _step_mjx(
     )
 
     def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
-        q, dq = data.qpos[7:], data.qvel[6:]
-        torque = motor_torque(robot, dynamics, q, dq, target)
-        damping = motor_damping(robot, dynamics, q, dq, target, torque)
-        data = data.replace(ctrl=servo_control(robot, torque, damping, q, dq))
-        servos = model.actuator_biasprm.at[:, SERVO_DAMPING].set(-damping)
-        return mjx.step(model.replace(actuator_biasprm=servos), data), torque
+        torque, ctrl, bias = drive(robot, dynamics, data.qpos[7:], data.qvel[6:], target)
+        servos = model.actuator_biasprm.at[:, SERVO_DAMPING].set(bias)
+        return mjx.step(model.replace(actuator_biasprm=servos), data.replace(ctrl=ctrl)), torque
 
     with jax.default_matmul_precision("highest"):
         data, torques = jax.lax.scan(substep, data, None, length=config.decimation)
@@ -297,11 +304,9 @@ def _host_step(
         qpos[:], qvel[:], warmstart[:] = state.qpos, state.qvel, state.qacc_warmstart
         torque = state.torque
         for i in range(config.decimation):
-            q, dq = qpos[:, 7:], qvel[:, 6:]
-            torque = motor_torque(robot, dynamics, q, dq, target, np)
-            damping = motor_damping(robot, dynamics, q, dq, target, torque, np)
-            ctrl[:] = servo_control(robot, torque, damping, q, dq)
-            servos[:, :, SERVO_DAMPING] = -damping
+            torque, ctrl[:], servos[:, :, SERVO_DAMPING] = drive(
+                robot, dynamics, qpos[:, 7:], qvel[:, 6:], target, np
+            )
             last = i == config.decimation - 1
             batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
         new = state.replace(
