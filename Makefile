@@ -41,7 +41,7 @@ lint: $(STAMP) ## ruff and ty
 bench: $(STAMP) ## Throughput of a whole training step
 	@$(BIN)/python -m benchmarks.throughput --repeats 3 $(ARGS)
 
-bench-full: $(STAMP) ## Every figure of docs/performance.md, against Brax and torch too: half an hour
+bench-full: $(STAMP) ## The figures of docs/performance.md, against Brax and torch too: half an hour
 	@$(PIP) -e '.[bench]'
 	@$(BIN)/python -m benchmarks.throughput
 	@$(BIN)/python -m benchmarks.parts --out docs/profile.png

@@ -8,8 +8,9 @@
 | `compile_time` | first start and later starts |
 | `memory` | peak memory and speed over environments and frames |
 | `gpu` | all that matters on a machine with an accelerator, in one go |
+| `start_test`, `kill_test` | not speed: hundreds of starts, hundreds of kills |
 
-Each prints a table, and with `--json` keeps the numbers.
+Each prints a table, and the first five keep the numbers with `--json`.
 """
 
 from kslc_jax import runtime

@@ -9,7 +9,7 @@ The folder `--out` then holds three files, small enough to carry away: `results.
 `metrics.jsonl` and `checkpoint.tgz`. Unpacked, the last is a checkpoint without environments: all
 of `evaluate`, `play` and `export` take it, and so does `--start` here.
 
-  python -m benchmarks.gpu --out go1 [--minutes 8.5] [--num-envs 4096 1024 2048 8192 16384]
+  python -m benchmarks.gpu --out go1 [--minutes 8.5] [--num-envs 4096 1024 8192 16384 2048]
   python -m benchmarks.gpu --out go2 --start go1/checkpoint.tgz --only-train
   python -m benchmarks.gpu --out tiny --tiny        # does it run? On any machine
 """

@@ -1,9 +1,9 @@
 """KSLC against its baseline and its ablations: python -m kslc_jax.compare [--seeds 0 1 2]
 
-Trains every variant from scratch, one after the other, each with every seed, and evaluates it over
-the commanded speeds. Unattended and resumable: what is finished is skipped, what was interrupted
-goes on from its checkpoint. Ends with one table; `python -m kslc_jax.plots` draws performance,
-momentum, and how each speed was learnt.
+Trains every variant from scratch, one after the other, KSLC and baseline with every seed, and
+evaluates it over the commanded speeds. Unattended and resumable: what is finished is skipped, what
+was interrupted goes on from its checkpoint. Ends with one table; `python -m kslc_jax.plots` draws
+performance, momentum, and how each speed was learnt.
 
 Examples:
   python -m kslc_jax.compare --steps 20000000

@@ -128,7 +128,8 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
 def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> None:
     """Bodies, hinges and motors, in the robot's joint order.
 
-    The servos' damping goes into the joints, which Drake integrates implicitly as MuJoCo does.
+    The servos' damping goes into the joints, which Drake integrates implicitly: all of it, where
+    MuJoCo is given `physics.motor_damping`.
     """
     for i in range(1, model.nbody):
         plant.AddRigidBody(model.body(i).name, _inertia(model, i))

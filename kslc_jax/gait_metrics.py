@@ -1,4 +1,4 @@
-"""Numbers that describe how a robot moves, from a `Trace`; numpy only.
+"""Numbers that describe how a robot moves, from a `Trace`, in numpy.
 
 All take the trace of one commanded speed, [T, N, ...], after some time to settle; trials that fell
 count as 0 m/s in the mean speed and nowhere else. `summary` puts them together. Angular momenta are

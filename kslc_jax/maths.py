@@ -1,4 +1,4 @@
-"""Quaternions, frames and safe norms: one vector at a time, vmapped by the caller.
+"""Quaternions, frames and norms: one vector at a time, vmapped by the caller.
 
 Quaternions are (w, x, y, z), unit length, and rotate body-frame vectors into the world frame.
 """

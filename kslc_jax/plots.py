@@ -77,7 +77,7 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
 
 
 def learning_curve(runs: dict[str, Records], out: Path) -> None:
-    """One panel per quantity, one line per run; the top axis is wall time of the first run."""
+    """One panel per quantity, one line per run; the first run's milestones tell its wall time."""
     figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True)
     for axis, (name, label, color) in zip(axes, PANELS, strict=True):
         for i, (run, records) in enumerate(runs.items()):

@@ -1,4 +1,4 @@
-"""Reward terms: small pure functions of one environment's `Inputs`, weighted and summed in `total`.
+"""Reward terms: small pure functions of one environment's `Inputs`, and their weighted sum.
 
 Every term returns its unweighted value, which is logged. Terms are Humanoid-Gym's (HG) unless an
 equation of the paper is named; where an equation cannot mean what it says, docs/fidelity.md tells
@@ -219,10 +219,10 @@ def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """Motion, distance from the default pose and restless actions while asked to stand (ours).
 
-    The actions' changes count squared: exploration then adds the same to all of them, and hides
-    nothing of how the policy itself trembles."""
+    The actions' changes count squared: what exploration adds is then the same for every policy,
+    and does not hide how it trembles by itself."""
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
-    restless = 0.5 * jnp.sum(jnp.square(x.action - x.last_action))
+    restless = cfg.restless * jnp.sum(jnp.square(x.action - x.last_action))
     return jnp.where(x.command.moving, 0.0, moved + restless)
 
 

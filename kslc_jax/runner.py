@@ -82,7 +82,7 @@ def train(
     mesh: Mesh | None = None,
     profile: int = 0,
 ) -> TrainState:
-    """Trains until `config.run.steps`, a signal, or an error; the state is saved in each case.
+    """Trains until `config.run.steps` or a signal, and saves the state; every few minutes too.
 
     Args:
       config: what to train.

@@ -24,7 +24,6 @@ class Signals:
     joint_vel: jax.Array  # [16] rad/s
     torque: jax.Array  # [16] N m
     base_pos: jax.Array  # [3] m, world
-    base_quat: jax.Array  # [4]
     base_euler: jax.Array  # [3] roll, pitch, yaw [rad]
     base_linvel: jax.Array  # [3] m/s, base frame
     base_angvel: jax.Array  # [3] rad/s, base frame
@@ -56,7 +55,6 @@ def read(robot: Robot, state: PhysicsState) -> Signals:
         joint_vel=state.qvel[6:],
         torque=state.torque,
         base_pos=state.qpos[:3],
-        base_quat=quat,
         base_euler=maths.quat_to_euler(quat),
         base_linvel=maths.quat_rotate_inverse(quat, state.qvel[:3]),
         base_angvel=angvel,

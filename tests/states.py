@@ -29,7 +29,6 @@ def make_signals(**changes: Any) -> Signals:
         joint_vel=np.zeros(16),
         torque=np.zeros(16),
         base_pos=[0.0, 0.0, 0.89],
-        base_quat=[1.0, 0.0, 0.0, 0.0],
         base_euler=np.zeros(3),
         base_linvel=np.zeros(3),
         base_angvel=np.zeros(3),

@@ -289,7 +289,7 @@ def controller_of(runner, path, states, i):
 
 
 def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajectory):
-    """The one place that builds observations a second time: all frames of a second."""
+    """It builds observations a second time: all frames of a second."""
     qpos, qvel = trajectory.physics.qpos, trajectory.physics.qvel
     assert (trajectory.time == np.arange(len(qpos))[:, None]).all()  # nobody has fallen
     assert trajectory.command.moving.all() != policy.config.command.stand_still

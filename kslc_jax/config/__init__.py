@@ -1,7 +1,7 @@
 """Every number that a user may change, as frozen, checked dataclasses, and the named presets.
 
-Imports no JAX: a config can be read, checked and printed before anything heavy starts. One value
-lives in one place. `rewards.weights` holds one field per reward term of `kslc_jax.rewards.TERMS`.
+Imports no JAX: a config can be read, checked and printed before anything heavy starts.
+`rewards.weights` holds one field per reward term of `kslc_jax.rewards.TERMS`.
 
 Sources: "paper" is Zhang et al., KSLC (Tables I and II, Eq. 2 to 10); "HG" is Humanoid-Gym, which
 the paper builds on and which settles what the paper leaves open. Each departure is explained in

@@ -92,6 +92,7 @@ _LAPTOP = _override(
         "lateral_distance": True,
         "lean_per_speed": 0.03,
         "exact_full": 2.0,
+        "restless": 0.5,
         "weights": {
             "feet_contact_number": 2.0,
             "feet_clearance": 0.7,

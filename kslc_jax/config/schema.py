@@ -330,6 +330,8 @@ class RewardConfig:
     """Upper end of the commanded range [m/s] up to which `tracking_mean_vel` is nothing."""
     exact_full: float = 2.5
     """The same from where on it has its full size."""
+    restless: float = 0.0
+    """How much the squared changes of the action count within `stand_still`."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which dof_vel_limits counts."""
 

@@ -18,6 +18,7 @@ YOUNGER: dict[str, Any] = {
     "config.gait.stride_sweep": 0.0,
     "config.rewards.weights.tracking_mean_vel": 0.0,
     "config.rewards.clearance_mid_swing": False,
+    "config.rewards.restless": 0.0,
     "config.rewards.exact_from": 0.5,
     "config.rewards.exact_full": 2.5,
     "config.curriculum.gait_threshold": -1.0,
