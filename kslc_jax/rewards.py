@@ -128,11 +128,15 @@ def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
 def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """exp(-10 |xy error of the mean velocity|), the mean over about one gait cycle (ours).
 
-    Within a stride the speed swings by more than the error that matters over many strides. Grows
-    with the commanded range, from nothing at the start: exact speed is for those who can walk."""
+    Within a stride the speed swings by more than the error that matters over many strides."""
     exact = jnp.exp(-10.0 * norm(x.gait.mean_velocity - x.command.velocity[:2]))
+    return exact * _exactness(cfg, x)
+
+
+def _exactness(cfg: RewardConfig, x: Inputs) -> jax.Array:
+    """Grows from 0 to 1 with the commanded range: being exact is for those who can walk."""
     grown = (x.v_max - cfg.exact_from) / (cfg.exact_full - cfg.exact_from)
-    return exact * jnp.clip(grown, 0.0, 1.0)
+    return jnp.clip(grown, 0.0, 1.0)
 
 
 # --------------------------------------------------------------------------------------- HG: feet
@@ -220,9 +224,11 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
     """Motion, distance from the default pose and restless actions while asked to stand (ours).
 
     The actions' changes count squared: what exploration adds is then the same for every policy,
-    and does not hide how it trembles by itself."""
+    and does not hide how it trembles by itself. It is so much at first that it would hide all else:
+    they count the more the wider the commanded range."""
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
-    restless = cfg.restless * jnp.sum(jnp.square(x.action - x.last_action))
+    changes = jnp.sum(jnp.square(x.action - x.last_action))
+    restless = cfg.restless * _exactness(cfg, x) * changes
     return jnp.where(x.command.moving, 0.0, moved + restless)
 
 

@@ -101,7 +101,6 @@ def test_what_the_paper_leaves_to_humanoid_gym():
     assert (c.vy, c.heading, c.resample_seconds) == ((-0.3, 0.3), (-3.14, 3.14), 8.0)
     assert (c.dead_zone, c.heading_gain, c.max_yaw_rate) == (0.2, 0.5, 1.0)
     assert (c.stand_fraction, c.forward_fraction, c.narrow_speed) == (0.0, 0.0, 0.0)
-    assert c.slow_fraction == 0.0
     assert not c.stand_still
     g = PAPER.gait
     assert (g.cycle_time, g.double_support, g.reference_scale) == (0.64, 0.1, 0.17)
@@ -185,7 +184,6 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "ppo.entropy_fades": True,
         "command.stand_fraction": 0.1,
         "command.forward_fraction": 0.2,
-        "command.slow_fraction": 0.15,
         "command.narrow_speed": 4.0,
         "command.stand_still": True,
         "gait.double_support_at_speed": -0.4,
@@ -209,7 +207,6 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.base_height_kernel": 30.0,
         "rewards.base_height_drop": 0.0,
         "rewards.exact_full": 2.0,
-        "rewards.restless": 0.5,
         "rewards.clearance_width": 0.03,
         "rewards.clearance_mid_swing": True,
         "rewards.clearance_speed_gain": 0.5,

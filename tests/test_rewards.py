@@ -370,13 +370,14 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ),
     ("collision", KSLC, {}, 0.0),
     ("collision", KSLC, {"torso_contact": True}, 1.0),
-    # 0.5 + 0.1 * 2; with what is restless, 0.5 * (0.6^2 + 0.8^2), on top.
+    # 0.5 + 0.1 * 2; with what is restless, 0.5 * (0.6^2 + 0.8^2), on top, half way half of it.
     *(
         (
             "stand_still",
             dataclasses.replace(KSLC, restless=restless),
             {
                 "moving": False,
+                "v_max": v_max,
                 "joint_pos": joints(left_knee=0.3, right_knee=0.4),
                 "joint_vel": joints(left_knee=2.0),
                 "action": joints(left_knee=0.1, right_knee=-0.8),
@@ -384,7 +385,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
             },
             value,
         )
-        for restless, value in ((0.0, 0.7), (0.5, 1.2))
+        for restless, v_max, value in ((0.0, 3.5, 0.7), (0.5, 3.5, 1.2), (0.5, 1.5, 0.95))
     ),
     (
         "stand_still",

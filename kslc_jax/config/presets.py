@@ -54,7 +54,6 @@ _LAPTOP = _override(
     command={
         "stand_fraction": 0.1,
         "forward_fraction": 0.2,
-        "slow_fraction": 0.15,
         "narrow_speed": 4.0,
         "stand_still": True,
     },
@@ -92,7 +91,6 @@ _LAPTOP = _override(
         "lateral_distance": True,
         "lean_per_speed": 0.03,
         "exact_full": 2.0,
-        "restless": 0.5,
         "weights": {
             "feet_contact_number": 2.0,
             "feet_clearance": 0.7,

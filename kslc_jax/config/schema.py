@@ -327,11 +327,12 @@ class RewardConfig:
     lean_per_speed: float = 0.0
     """Forward lean [rad per m/s] that `orientation` takes as upright."""
     exact_from: float = 0.5
-    """Upper end of the commanded range [m/s] up to which `tracking_mean_vel` is nothing."""
+    """Upper end of the commanded range [m/s] up to which `tracking_mean_vel` and `restless` are
+    nothing."""
     exact_full: float = 2.5
-    """The same from where on it has its full size."""
+    """The same from where on they have their full size."""
     restless: float = 0.0
-    """How much the squared changes of the action count within `stand_still`."""
+    """How much the squared changes of the action count within `stand_still`, at full size."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which dof_vel_limits counts."""
 
