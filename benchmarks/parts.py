@@ -6,6 +6,7 @@ need not be the whole: `unaccounted` says by how much.
 
   python -m benchmarks.parts [--preset laptop] [--engines mujoco mjx] [--out docs/profile.png]
   python -m benchmarks.parts --trace runs/trace     # for xprof, Perfetto or TensorBoard
+  python -m benchmarks.parts --trace runs/trace --out docs/timeline.png     # and as a picture
 """
 
 from collections.abc import Callable
@@ -19,7 +20,7 @@ import matplotlib
 import numpy as np
 import tyro
 
-from benchmarks import throughput, timing
+from benchmarks import throughput, timeline, timing
 from kslc_jax import networks, ppo, profiling, train_step
 from kslc_jax.config import Config, preset
 
@@ -137,7 +138,7 @@ class Args:
     engines: tuple[str, ...] = ("mujoco", "mjx")
     """Physics engines to compare."""
     out: Path | None = None
-    """Picture of the parts, one bar per engine."""
+    """Picture of the parts, one bar per engine; with --trace, of what the threads do when."""
     json: Path | None = None
     """File for the numbers."""
     trace: Path | None = None
@@ -149,6 +150,9 @@ def main(args: Args) -> None:
     base = preset(args.preset)
     if args.trace is not None:
         trace(timing.on_engine(base, args.engines[0]), args.trace)
+        if args.out is not None:
+            title = f"one train step of the {args.preset} preset, {args.engines[0]} engine"
+            timeline.draw(timeline.read(args.trace), title, args.out)
         return
     results = {}
     for engine in args.engines:

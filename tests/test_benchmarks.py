@@ -1,5 +1,6 @@
 """The benchmarks: that both sides do the same work, and that all of them run."""
 
+import gzip
 import json
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import kslc_jax
-from benchmarks import compile_time, gpu, memory, parts, purejaxrl, throughput, timing
+from benchmarks import compile_time, gpu, memory, parts, purejaxrl, throughput, timeline, timing
 from kslc_jax import observations, physics, randomize, signals, train_step
 from kslc_jax.config import preset
 
@@ -39,6 +40,42 @@ def test_parts_add_up():
         dict(zip(parts.PARTS, (1.0, 0.5, 0.1, 0.8, 1.2), strict=True))
         | {"unaccounted": 0.4, "whole": 4.0}
     )
+
+
+def test_timeline_of_a_trace(tmp_path):
+    """Only operations that consist of no others count; seconds, from the first one's start."""
+
+    def event(name, start, length, thread=1, **args):
+        return {"ph": "X", "name": name, "ts": start, "dur": length, "tid": thread, "args": args}
+
+    work = [("pure_callback.4", 3e6, 2e6), ("dot.1", 5e6, 1e6), ("add_fusion.2", 6e6, 5e5)]
+    events = [
+        {"ph": "M", "name": "thread_name", "tid": 1, "args": {"name": "tf_XLAEigen"}},
+        event("python", 0.0, 9e6),
+        event("while.7", 1e6, 8e6, hlo_op="while.7"),
+        *(event(name, start, length, hlo_op=name) for name, start, length in work),
+        event("end: dot.1", 6e6, 1.0, hlo_op="dot.1"),
+        event("dot_general.3", 5e6, 1e6, thread=2, hlo_op="dot_general.3"),
+    ]
+    folder = tmp_path / "plugins/profile/now"
+    folder.mkdir(parents=True)
+    (folder / "vm.trace.json.gz").write_bytes(
+        gzip.compress(json.dumps({"traceEvents": events}).encode())
+    )
+    operations = timeline.read(tmp_path)
+    assert operations == [
+        (1, "physics", 0.0, 2.0),
+        (1, "matrix products", 2.0, 3.0),
+        (1, "other operations", 3.0, 3.5),
+        (2, "matrix products", 2.0, 3.0),
+    ]
+    assert timeline.seconds(operations) == {
+        "physics": 2.0,
+        "matrix products": 2.0,
+        "other operations": 0.5,
+    }
+    timeline.draw(operations, "a trace", tmp_path / "timeline.png")
+    assert (tmp_path / "timeline.png").stat().st_size > 5000
 
 
 def test_ratios_are_of_each_turn():
