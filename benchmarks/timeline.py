@@ -59,19 +59,19 @@ def seconds(operations: list[Operation]) -> dict[str, float]:
 def draw(operations: list[Operation], title: str, out: Path) -> None:
     """A row for each thread that does more than a hundredth of it all, a color for each kind, with
     thread-seconds in the legend."""
-    rows: dict[int, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
-    busy: dict[int, float] = defaultdict(float)
+    by_thread: dict[int, list[Operation]] = defaultdict(list)
     for op in operations:
-        rows[op.thread][op.kind].append((op.start, op.end - op.start))
-        busy[op.thread] += op.end - op.start
-    threads = [thread for thread in sorted(rows) if busy[thread] > 0.01 * sum(busy.values())]
-    figure, axis = plt.subplots(figsize=(9, 1.4 + 0.5 * len(threads)))
-    for row, thread in enumerate(threads):
-        for kind, spans in rows[thread].items():
-            axis.broken_barh(spans, (row - 0.4, 0.8), color=COLORS[kind], lw=0)
-    for kind, total in seconds(operations).items():
-        axis.barh(0, 0, color=COLORS[kind], label=f"{kind}, {total:.2f} s")
-    axis.set_yticks(range(len(threads)), [f"thread {i + 1}" for i in range(len(threads))])
+        by_thread[op.thread].append(op)
+    totals = seconds(operations)
+    least = 0.01 * sum(totals.values())
+    rows = [ops for _, ops in sorted(by_thread.items()) if sum(seconds(ops).values()) > least]
+    figure, axis = plt.subplots(figsize=(9, 1.4 + 0.5 * len(rows)))
+    for what, color in COLORS.items():
+        for row, ops in enumerate(rows):
+            spans = [(op.start, op.end - op.start) for op in ops if op.kind == what]
+            axis.broken_barh(spans, (row - 0.4, 0.8), color=color, lw=0)
+        axis.barh(0, 0, color=color, label=f"{what}, {totals[what]:.2f} s")
+    axis.set_yticks(range(len(rows)), [f"thread {i + 1}" for i in range(len(rows))])
     axis.set_xlabel("seconds from the start of the train step")
     axis.set_title(title, fontsize=10)
     axis.legend(ncols=3, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.3), frameon=False)

@@ -29,8 +29,10 @@ def sample(
     Fast commands come with small side steps and turns: with `narrow_speed` both shrink linearly.
     """
     keys = jax.random.split(key, 5)
-    slow = jax.random.bernoulli(keys[4], config.slow_fraction)
-    top = jnp.where(slow, jnp.clip(config.slow_speed, *vx_range), vx_range[1])
+    top = vx_range[1]
+    if config.slow_fraction > 0:
+        slow = jax.random.bernoulli(keys[4], config.slow_fraction)
+        top = jnp.where(slow, jnp.clip(config.slow_speed, *vx_range), top)
     vx = jax.random.uniform(keys[0], minval=vx_range[0], maxval=top)
     vy = jax.random.uniform(keys[1], minval=config.vy[0], maxval=config.vy[1])
     heading = jax.random.uniform(keys[2], minval=config.heading[0], maxval=config.heading[1])

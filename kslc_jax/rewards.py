@@ -227,8 +227,7 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
     and does not hide how it trembles by itself. It is so much at first that it would hide all else:
     they count the more the wider the commanded range."""
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
-    changes = jnp.sum(jnp.square(x.action - x.last_action))
-    restless = cfg.restless * _exactness(cfg, x) * changes
+    restless = cfg.restless * _exactness(cfg, x) * _action_change(x)
     return jnp.where(x.command.moving, 0.0, moved + restless)
 
 
@@ -237,9 +236,13 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
 def action_smoothness(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """First and second differences of the action, and its size."""
-    first = jnp.sum(jnp.square(x.action - x.last_action))
     second = jnp.sum(jnp.square(x.action + x.last_last_action - 2.0 * x.last_action))
-    return first + second + 0.05 * jnp.sum(jnp.abs(x.action))
+    return _action_change(x) + second + 0.05 * jnp.sum(jnp.abs(x.action))
+
+
+def _action_change(x: Inputs) -> jax.Array:
+    """Squared change of the action since the control step before."""
+    return jnp.sum(jnp.square(x.action - x.last_action))
 
 
 def torques(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
