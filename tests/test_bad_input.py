@@ -295,7 +295,7 @@ class TestCompare:
         assert word in said and not (run_dir / "new").exists()
 
     @few
-    @given(st.integers(-(2**40), 0), st.sampled_from(["steps", "trials"]))
+    @given(st.integers(-(2**40), 0), st.sampled_from(["steps", "snapshots", "trials"]))
     def test_no_positive_count(self, run_dir, value, name):
         assert name in refused(compare.main, "--out", run_dir / "new", f"--{name}", value)
 
