@@ -35,6 +35,7 @@ _LAPTOP_LEARNER: dict[str, Any] = {
         "critic": (256, 128, 64),
         "init_std": 0.6,
         "init_mean": 0.01,
+        "symmetric": True,
     },
     "ppo": {
         "rollout_steps": 24,
@@ -49,11 +50,11 @@ _LAPTOP_LEARNER: dict[str, Any] = {
 
 _LAPTOP = _override(
     _override(_PAPER, **_LAPTOP_LEARNER),
-    network={"symmetric": True},
     ppo={"entropy_fades": True},
     command={
         "stand_fraction": 0.1,
         "forward_fraction": 0.2,
+        "slow_fraction": 0.15,
         "narrow_speed": 4.0,
         "stand_still": True,
     },
@@ -91,6 +92,7 @@ _LAPTOP = _override(
         "lateral_distance": True,
         "lean_per_speed": 0.03,
         "exact_full": 2.0,
+        "restless": 0.3,
         "weights": {
             "feet_contact_number": 2.0,
             "feet_clearance": 0.7,
