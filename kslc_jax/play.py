@@ -3,7 +3,8 @@
 Opens a live viewer in the browser: sliders command the robot while it runs. With --gait-strip or
 --video it draws, off screen, the paper's gait figure (the robot every 0.25 s on a 1 m grid, one
 strip per speed) or a film of one speed after the other instead. Full C MuJoCo at high fidelity
-unless told otherwise. POLICY is a run folder, a checkpoint folder, or a shipped policy's name.
+unless told otherwise; strips and films also in Drake. POLICY is a run folder, a checkpoint folder,
+or a shipped policy's name.
 """
 
 import contextlib
@@ -18,7 +19,7 @@ from typing import Literal
 
 import tyro
 
-from kslc_jax import evaluate, runtime
+from kslc_jax import evaluate, runtime, sim2sim
 from kslc_jax.config import ConfigError
 
 FPS = 50
@@ -35,6 +36,8 @@ class Args:
     """Run folder, checkpoint folder, or name of a shipped policy."""
     fidelity: Literal["train", "high"] = "high"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
+    engine: sim2sim.Engine = "mujoco"
+    """What simulates strip and video; drake needs its package (pip install 'kslc_jax[drake]')."""
     seed: int = 0
     """Of the initial state."""
     host: str = "127.0.0.1"
@@ -57,6 +60,8 @@ class Args:
             raise ConfigError("speeds: name at least one, finite")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
+        if self.live and self.engine != "mujoco":
+            raise ConfigError(f"engine: {self.engine} is for --gait-strip and --video only")
 
     @property
     def live(self) -> bool:
@@ -77,7 +82,11 @@ def record(args: Args, policy, settle: float = 4.0):
     velocities = np.zeros((len(args.speeds), 3))
     velocities[:, 0] = args.speeds
     engine = trials.engine(policy, args.fidelity)
-    setting = trials.Setting(engine, seconds=settle + max(1.0, np.ceil(args.seconds)))
+    setting = trials.Setting(
+        engine,
+        seconds=settle + max(1.0, np.ceil(args.seconds)),
+        simulate=sim2sim.simulator(args.engine),
+    )
     trace = trials.join(list(trials.run(policy, setting, velocities, args.seed)))
     start = round(settle / engine.control_dt)
     stop = start + round(args.seconds / engine.control_dt)

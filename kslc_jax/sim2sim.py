@@ -29,6 +29,8 @@ import tyro
 from kslc_jax import evaluate, runtime
 from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig
 
+Engine = Literal["mujoco", "drake"]
+
 PUSH_SECONDS = 4.0
 """Time between pushes."""
 
@@ -60,7 +62,7 @@ class Args:
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
-    engine: Literal["mujoco", "drake"] = "mujoco"
+    engine: Engine = "mujoco"
     """mujoco: C MuJoCo on all cores. drake: one robot at a time, slow, and needs the package drake
     (pip install 'kslc_jax[drake]')."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
@@ -112,15 +114,22 @@ def changes(condition: str) -> dict[str, Any]:
 _ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
 
 
+def simulator(engine: Engine):
+    """What steps `trials.Setting`s in that engine: None for MuJoCo, which is what their physics
+    config says; ConfigError where it is not installed."""
+    if engine == "mujoco":
+        return None
+    try:
+        from kslc_jax import drake
+    except ImportError as error:
+        raise ConfigError(f"{error}; try: pip install 'kslc_jax[drake]'") from error
+    return drake.step
+
+
 def setting(args: Args, condition: str):
     """The conditions of one sweep, a `trials.Setting`."""
     from kslc_jax import trials
 
-    simulate = None
-    if args.engine == "drake":
-        from kslc_jax import drake
-
-        simulate = drake.step
     made = changes(condition)
     robot = {name: value for name, value in made.items() if name in _ROBOT}
     rest = {name: value for name, value in made.items() if name not in _ROBOT}
@@ -130,7 +139,7 @@ def setting(args: Args, condition: str):
         seconds=args.seconds,
         noise=args.noise,
         latency=args.latency,
-        simulate=simulate,
+        simulate=simulator(args.engine),
         **rest,
     )
 
@@ -174,10 +183,7 @@ def main(argv: list[str] | None = None) -> int:
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
-        try:
-            setting(args, "nominal")
-        except ImportError as error:
-            raise ConfigError(f"{error}; try: pip install 'kslc_jax[drake]'") from error
+        simulator(args.engine)  # what is not installed is told before anything is loaded
         _report(args)
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)

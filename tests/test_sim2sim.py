@@ -2,11 +2,13 @@
 
 import dataclasses
 import json
+import sys
 
 import jax
 import numpy as np
 import pytest
 
+import kslc_jax
 from kslc_jax import (
     checkpoint,
     curriculum,
@@ -172,9 +174,7 @@ def test_errors_are_one_line(argv, says, capsys):
 
 
 def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
-    def missing(args, condition):
-        raise ModuleNotFoundError("No module named 'pydrake'")
-
-    monkeypatch.setattr(sim2sim, "setting", missing)
+    monkeypatch.setitem(sys.modules, "kslc_jax.drake", None)
+    monkeypatch.delattr(kslc_jax, "drake", raising=False)
     assert sim2sim.main(["x", "--engine", "drake"]) == 2
     assert "pip install 'kslc_jax[drake]'" in capsys.readouterr().err

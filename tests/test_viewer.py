@@ -264,6 +264,7 @@ def test_viewer_not_installed_is_one_line(run_dir, capsys, monkeypatch):
         (["no-such-policy"], "no run, checkpoint or shipped policy"),
         (["x", "--port", "70000"], "port must lie in"),
         (["x", "--seconds", "0"], "seconds must be positive"),
+        (["x", "--engine", "drake"], "engine: drake is for --gait-strip and --video only"),
     ],
 )
 def test_errors_are_one_line(argv, says, capsys):
