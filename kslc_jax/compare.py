@@ -17,13 +17,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from kslc_jax import config as config_lib
 from kslc_jax import evaluate
-from kslc_jax.config import ConfigError
+from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.plots import EVALUATION
 
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
@@ -53,7 +52,7 @@ class Args:
     """Commanded speeds of the evaluation [m/s]."""
     trials: int = 8
     """Trials per speed."""
-    fidelity: Literal["train", "high"] = "high"
+    fidelity: Fidelity = "high"
     """What the evaluation simulates, as `evaluate` has it; high is the same for every preset."""
 
     def __post_init__(self):

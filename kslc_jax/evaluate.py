@@ -14,12 +14,11 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from kslc_jax import runtime
-from kslc_jax.config import ConfigError
+from kslc_jax.config import ConfigError, Fidelity
 
 HEADLINE = (
     ("survival", "survived", "{:.0%}"),
@@ -60,7 +59,7 @@ class Args:
     """Trials per speed."""
     seconds: float = 20.0
     """Length of a trial."""
-    fidelity: Literal["train", "high"] = "train"
+    fidelity: Fidelity = "train"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
     noise: bool = False
     """Sensor noise, action delay and action noise, the most that training has."""

@@ -15,12 +15,11 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
 from kslc_jax import evaluate, runtime, sim2sim
-from kslc_jax.config import ConfigError
+from kslc_jax.config import ConfigError, Fidelity
 
 FPS = 50
 
@@ -34,7 +33,7 @@ class Args:
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
-    fidelity: Literal["train", "high"] = "high"
+    fidelity: Fidelity = "high"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
     engine: sim2sim.Engine = "mujoco"
     """What simulates strip and video; drake needs its package (pip install 'kslc_jax[drake]')."""

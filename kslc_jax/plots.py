@@ -184,7 +184,7 @@ def learning(methods: dict[str, list[Curve]], out: Path) -> None:
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(speeds) :]:
         axis.set_visible(False)
-    for axis in axes.flat[max(0, len(speeds) - columns) : len(speeds)]:
+    for axis in axes.flat[len(speeds) - columns : len(speeds)]:
         axis.tick_params(labelbottom=True)  # the lowest of its column
     figure.supxlabel("environment steps [millions]", fontsize=10)
     figure.supylabel("mean forward speed [m/s]", fontsize=10)
@@ -225,8 +225,9 @@ def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
 
 def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
     """Angular momentum about the vertical of whole body, legs and arms, a panel per method."""
+    size = (4.5 * len(methods), 4)
     figure, axes = plt.subplots(
-        *(1, len(methods)), figsize=(4.5 * len(methods), 4), sharex=True, sharey=True, squeeze=False
+        1, len(methods), figsize=size, sharex=True, sharey=True, squeeze=False
     )
     for axis, (method, seeds) in zip(axes[0], methods.items(), strict=True):
         for i, (name, label) in enumerate(MOMENTUM):

@@ -7,12 +7,11 @@ evaluation: 1 ms, elliptic cones, converged solver, self-collision, joint fricti
 import functools
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import mujoco
 import numpy as np
 
-Fidelity = Literal["train", "high"]
+from kslc_jax.config import Fidelity
 
 MODEL_PATH = Path(__file__).parent / "assets" / "xbot_l.xml"
 

@@ -22,8 +22,7 @@ from trimesh.visual.material import PBRMaterial
 from kslc_jax import checkpoint, panel, trials
 from kslc_jax import robot as robot_lib
 from kslc_jax.checkpoint import CheckpointError, Policy, load_policy
-from kslc_jax.config import ConfigError
-from kslc_jax.robot import Fidelity
+from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.session import Pacer, Session, View
 
 FPS = 30

@@ -10,6 +10,8 @@ NUM_JOINTS = 16
 
 Range = tuple[float, float]
 
+Fidelity = Literal["train", "high"]
+
 
 class ConfigError(Exception):
     """A config value that cannot work; the message names the field and the fix."""
@@ -48,7 +50,7 @@ def _check_range(name: str, value: Range) -> None:
 class PhysicsConfig:
     """Simulation of one control step."""
 
-    fidelity: ClassVar[Literal["train", "high"]] = "train"
+    fidelity: ClassVar[Fidelity] = "train"
 
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: pure XLA, any device. mujoco: C MuJoCo on all CPU cores behind one callback, faster on
@@ -81,7 +83,7 @@ class PhysicsConfig:
 class HighFidelity(PhysicsConfig):
     """Evaluation in full C MuJoCo: 1 ms, converged solver, and what robot.load("high") adds."""
 
-    fidelity: ClassVar[Literal["train", "high"]] = "high"
+    fidelity: ClassVar[Fidelity] = "high"
 
     engine: Literal["auto", "mjx", "mujoco"] = "mujoco"
     timestep: float = 0.001
