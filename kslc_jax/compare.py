@@ -2,28 +2,36 @@
 
 Trains every variant from scratch, one after the other, KSLC and baseline with every seed, and
 evaluates it over the commanded speeds. Unattended and resumable: what is finished is skipped, what
-was interrupted goes on from its checkpoint. Ends with one table; `python -m kslc_jax.plots` draws
-performance, momentum, and how each speed was learnt.
+was interrupted goes on from its checkpoint. Ends with one table, in Markdown; `python -m
+kslc_jax.plots` draws performance, momentum, and how each speed was learnt.
 
 Examples:
   python -m kslc_jax.compare --steps 20000000
   python -m kslc_jax.compare --preset paper --baseline baseline --seeds 0 1 2 3 4
-  python -m kslc_jax.compare --variants kslc no-arms --seeds 0
+  python -m kslc_jax.compare --variants kslc no-arms --seeds 0 --keep docs/results/compare
 """
 
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from rich import box
+from rich.console import Console
+from rich.table import Table
 
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate
+from kslc_jax import evaluate, plots
 from kslc_jax.config import ConfigError, Fidelity
+from kslc_jax.learning import LEARNING
+from kslc_jax.logs import METRICS, write_whole
 from kslc_jax.plots import EVALUATION
+
+WIDTH = 200
+"""Columns of the table, whatever the terminal has: to be copied, not torn."""
 
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
 
@@ -34,6 +42,8 @@ class Args:
 
     out: Path = Path("runs/compare")
     """One run folder per variant and seed goes in here."""
+    keep: Path | None = None
+    """Where to copy what table and figures need of all that is finished in `out`, 50 kB a run."""
     variants: tuple[str, ...] = VARIANTS
     """kslc, baseline, and no-PART for each ablation."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -56,6 +66,8 @@ class Args:
     """What the evaluation simulates, as `evaluate` has it; high is the same for every preset."""
 
     def __post_init__(self):
+        if self.keep and self.keep.resolve() == self.out.resolve():
+            raise ConfigError("keep must not be out: a copy drops most of a training's metrics")
         unknown = sorted(set(self.variants) - set(VARIANTS))
         if unknown:
             raise ConfigError(f"variants: unknown {unknown[0]!r} (known: {', '.join(VARIANTS)})")
@@ -129,19 +141,57 @@ def call(module: str, arguments: tuple[str, ...]) -> bool:
         raise
 
 
-def table(out: Path):
-    """Mean forward speed per commanded speed of all that is finished, as a rich table."""
-    from rich.table import Table
+def finished(out: Path) -> list[Path]:
+    """Run folders that have been evaluated."""
+    return sorted(path.parent for path in out.glob(f"*/{EVALUATION}"))
 
-    shown = Table(title="mean forward speed [m/s], 0 for trials that fell", title_justify="left")
-    found = sorted(out.glob(f"*/{EVALUATION}"))
-    results = {path.parent.name: json.loads(path.read_text())["rows"] for path in found}
-    shown.add_column("run")
-    for row in next(iter(results.values()), []):
-        shown.add_column(f"{row['command']:.1f}", justify="right")
-    for name, rows in results.items():
-        shown.add_row(name, *(f"{row['forward_mean']:.2f}" for row in rows))
+
+def keep(run: Path, folder: Path) -> None:
+    """Copies a finished run's evaluation, its learning curves and, of its metrics, what `plots`
+    reads: every tenth record and those at which the range of commands grew."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in (EVALUATION, LEARNING):
+        write_whole(folder / name, (run / name).read_text())
+    records = plots.read_metrics(run)
+    count = len(records["env_steps"])
+    kept = sorted({*range(0, count, 10), *plots.growth(records), count - 1})
+    rows = ({name: _short(records[name][i]) for name in plots.COLUMNS} for i in kept)
+    write_whole(folder / METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
+
+
+def _short(x: float) -> float:
+    return int(x) if x == int(x) else float(f"{x:.5g}")
+
+
+def table(runs: Sequence[Path]) -> Table:
+    """Per run the range of commands that it reached, when, and per command its mean forward speed
+    [m/s], or 'falls' where a trial fell."""
+    shown = Table(box=box.MARKDOWN)
+    for header in ("run", "v_max [m/s]", "after"):
+        shown.add_column(header, no_wrap=True)
+    results = {run: _speeds(run) for run in runs}
+    commands = sorted({command for speeds in results.values() for command in speeds})
+    for command in commands:
+        shown.add_column(f"{command:.1f}", justify="right")
+    for run, speeds in results.items():
+        shown.add_row(run.name, *_reached(run), *(speeds.get(v, "-") for v in commands))
     return shown
+
+
+def _speeds(run: Path) -> dict[float, str]:
+    rows = json.loads((run / EVALUATION).read_text())["rows"]
+    return {
+        row["command"]: f"{row['forward_mean']:.2f}" if row["survival"] == 1.0 else "falls"
+        for row in rows
+    }
+
+
+def _reached(run: Path) -> tuple[str, str]:
+    records = plots.read_metrics(run)
+    after = "start"
+    for _, steps, seconds in plots.milestones(records):
+        after = f"{steps / 1e6:.1f} M, {seconds / 60:.0f} min"
+    return f"{records['curriculum/v_max'][-1]:.1f}", after
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -151,6 +201,28 @@ def main(argv: list[str] | None = None) -> int:
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    try:
+        failed = run_all(args)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    done = finished(args.out)
+    print("mean forward speed [m/s] per command:")
+    Console(highlight=False, markup=False, width=WIDTH).print(table(done))
+    try:
+        if args.keep:
+            for run_dir in done:
+                keep(run_dir, args.keep / run_dir.name)
+    except OSError as error:
+        print(f"error: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
+        return 1
+    if failed:
+        print(f"error: failed: {', '.join(failed)}; the same command tries again", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def run_all(args: Args) -> list[str]:
+    """Does what is not done before; the names of what failed."""
     failed = []
     todo = list(jobs(args))
     for i, job in enumerate(todo):
@@ -159,18 +231,9 @@ def main(argv: list[str] | None = None) -> int:
             print(f"[{i + 1}/{len(todo)}] {name}: done before")
             continue
         print(f"[{i + 1}/{len(todo)}] {name}", flush=True)
-        try:
-            if not run(job):
-                failed.append(name)
-        except KeyboardInterrupt:
-            print("stopped; the same command goes on from here", file=sys.stderr)
-            return 130
-    from rich.console import Console
-
-    Console(highlight=False).print(table(args.out))
-    if failed:
-        print(f"error: failed: {', '.join(failed)}; the same command tries again", file=sys.stderr)
-    return 1 if failed else 0
+        if not run(job):
+            failed.append(name)
+    return failed
 
 
 if __name__ == "__main__":

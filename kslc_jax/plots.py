@@ -69,11 +69,15 @@ def read_metrics(path: Path) -> Records:
     return records
 
 
+def growth(records: Records) -> np.ndarray:
+    """Indices of the records at which the commanded-speed range has grown."""
+    return np.flatnonzero(np.diff(records["curriculum/v_max"]) > 0) + 1
+
+
 def milestones(records: Records) -> list[tuple[float, float, float]]:
     """(v_max [m/s], environment steps, seconds) at each change of the commanded-speed range."""
     v = records["curriculum/v_max"]
-    changed = np.flatnonzero(np.diff(v) > 0) + 1
-    return [(v[i], records["env_steps"][i], records["seconds"][i]) for i in changed]
+    return [(v[i], records["env_steps"][i], records["seconds"][i]) for i in growth(records)]
 
 
 def learning_curve(runs: dict[str, Records], out: Path) -> None:

@@ -1,4 +1,4 @@
-"""The matrix of trainings: which jobs there are, and that a stopped matrix goes on."""
+"""The matrix of trainings: its jobs, that a stopped one goes on, its table, what is kept of it."""
 
 import json
 import os
@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from kslc_jax import compare
+from kslc_jax import compare, plots
 
 
 def test_every_variant_and_seed_is_a_job(tmp_path):
@@ -41,10 +41,23 @@ def test_an_interrupted_training_is_resumed(tmp_path):
     assert job.train[0] == "--resume" and "--preset" not in job.train
 
 
+def finished_run(folder, forward=0.97, survival=1.0):
+    """A run folder as a job leaves it, of 25 train steps, the range growing at the 14th."""
+    folder.mkdir(parents=True)
+    row = {"command": 1.0, "forward_mean": forward, "survival": survival}
+    (folder / compare.EVALUATION).write_text(json.dumps({"rows": [row]}))
+    (folder / compare.LEARNING).write_text("{}")
+    records = [
+        dict.fromkeys(plots.COLUMNS, 1 / 3)
+        | {"env_steps": 1e5 * i, "seconds": 10.0 * i, "curriculum/v_max": 0.5 + (i >= 14)}
+        | {"not in any figure": 1.0}
+        for i in range(1, 26)
+    ]
+    (folder / "metrics.jsonl").write_text("".join(f"{json.dumps(r)}\n" for r in records))
+
+
 def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, capsys):
-    done = tmp_path / "kslc-seed0" / compare.EVALUATION
-    done.parent.mkdir()
-    done.write_text(json.dumps({"rows": [{"command": 1.0, "forward_mean": 0.97}]}))
+    finished_run(tmp_path / "kslc-seed0")
     called = []
 
     def fake(module, arguments):
@@ -56,8 +69,39 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, 
     assert compare.main(argv) == 1
     assert called == ["train"]  # of the baseline; no evaluation of a failed training
     out = capsys.readouterr()
-    assert "done before" in out.out and "0.97" in out.out
+    assert "done before" in out.out
     assert "failed: baseline-seed0" in out.err
+
+
+def test_the_table_of_what_is_finished(tmp_path, capsys):
+    finished_run(tmp_path / "kslc-seed0")
+    finished_run(tmp_path / "kslc-seed1", survival=0.5)
+    argv = ["--out", str(tmp_path), "--variants", "kslc", "--seeds", "0", "1"]
+    assert compare.main(argv) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    head, _, first, second = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
+    assert head == ["run", "v_max [m/s]", "after", "1.0"]
+    assert first == ["kslc-seed0", "1.5", "1.4 M, 2 min", "0.97"]
+    assert second == ["kslc-seed1", "1.5", "1.4 M, 2 min", "falls"]
+
+
+def test_what_is_kept_draws_the_same_figures(tmp_path):
+    run, kept = tmp_path / "runs" / "kslc-seed0", tmp_path / "kept"
+    finished_run(run)
+    argv = ["--out", str(run.parent), "--keep", str(kept), "--variants", "kslc", "--seeds", "0"]
+    assert compare.main(argv) == 0
+    records, short = plots.read_metrics(run), plots.read_metrics(kept / run.name)
+    assert list(short) == list(plots.COLUMNS)
+    assert list(short["env_steps"] / 1e5) == [1, 11, 14, 21, 25]
+    assert plots.milestones(short) == plots.milestones(records)
+    assert list(short["episode_steps"]) == [0.33333] * 5
+    for name in (compare.EVALUATION, compare.LEARNING):
+        assert (kept / run.name / name).read_text() == (run / name).read_text()
+
+
+def test_keeping_never_writes_into_the_runs(tmp_path, capsys):
+    assert compare.main(["--out", str(tmp_path), "--keep", str(tmp_path / "x" / "..")]) == 2
+    assert "keep must not be out" in capsys.readouterr().err
 
 
 def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
