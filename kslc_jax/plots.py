@@ -82,7 +82,7 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
 
 def learning_curve(runs: dict[str, Records], out: Path) -> None:
     """One panel per quantity, one line per run; the first run's milestones tell its wall time."""
-    figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True)
+    figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True, layout="constrained")
     for axis, (name, label, color) in zip(axes, PANELS, strict=True):
         for i, (run, records) in enumerate(runs.items()):
             line = color if len(runs) == 1 else f"C{i}"
@@ -91,6 +91,7 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
     axes[-1].set_xlabel("environment steps [millions]")
+    figure.align_ylabels(axes)
     if len(runs) > 1:
         axes[0].legend(fontsize=8)
     first = next(iter(runs.values()))
@@ -172,11 +173,8 @@ def learning(methods: dict[str, list[Curve]], out: Path) -> None:
     """The paper's learning curves: mean forward speed over environment steps, a panel per commanded
     speed; mean and range over seeds."""
     speeds = next(iter(methods.values()))[0].speeds
-    columns = min(len(speeds), 4)
-    figure, axes = plt.subplots(
-        *(-(-len(speeds) // columns), columns), figsize=(12, 6), sharex=True, squeeze=False
-    )
-    for j, (axis, speed) in enumerate(zip(axes.flat, speeds, strict=False)):
+    figure, axes = _panels(len(speeds))
+    for j, (axis, speed) in enumerate(zip(axes, speeds, strict=True)):
         for i, (method, seeds) in enumerate(methods.items()):
             steps, values = seeds[0].env_steps / 1e6, np.array([c.reached[:, j] for c in seeds])
             axis.plot(steps, values.mean(0), "o-", color=f"C{i}", label=method, markersize=2)
@@ -186,14 +184,32 @@ def learning(methods: dict[str, list[Curve]], out: Path) -> None:
         axis.set_title(f"{speed:g} m/s commanded", fontsize=9)
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
-    for axis in axes.flat[len(speeds) :]:
-        axis.set_visible(False)
-    for axis in axes.flat[len(speeds) - columns : len(speeds)]:
-        axis.tick_params(labelbottom=True)  # the lowest of its column
     figure.supxlabel("environment steps [millions]", fontsize=10)
     figure.supylabel("mean forward speed [m/s]", fontsize=10)
-    axes[0, 0].legend(fontsize=8)
+    _legend(figure, axes[0])
     _save(figure, out)
+
+
+def _panels(count: int, **style):
+    """A figure of `count` panels, at most four in a row, and its axes."""
+    columns = min(count, 4)
+    rows = -(-count // columns)
+    size = (3.5 * columns, 3 * rows + 0.5)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=size, sharex=True, squeeze=False, layout="constrained", **style
+    )
+    for axis in axes.flat[count:]:
+        axis.set_visible(False)
+    for axis in axes.flat[count - columns : count]:
+        axis.tick_params(labelbottom=True)  # the lowest of its column
+    return figure, list(axes.flat[:count])
+
+
+def _legend(figure, axis) -> None:
+    """One legend for all panels, above them, of what one of them shows."""
+    handles, labels = axis.get_legend_handles_labels()
+    columns = min(len(labels), 8)
+    figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=8)
 
 
 def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: str, **style):
@@ -212,7 +228,7 @@ def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: 
 
 def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
     """The paper's performance figure: one panel per metric, over the commanded speed."""
-    figure, axes = plt.subplots(2, 3, figsize=(12, 6.5), sharex=True)
+    figure, axes = plt.subplots(2, 3, figsize=(12, 7), sharex=True, layout="constrained")
     for axis, (name, label) in zip(axes.flat, PERFORMANCE, strict=True):
         for i, (method, seeds) in enumerate(methods.items()):
             _over_commands(axis, method, f"C{i}", seeds, name)
@@ -221,7 +237,7 @@ def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
         axis.grid(alpha=0.3)
     top = max(row["command"] for seeds in methods.values() for row in seeds[0])
     axes[0, 0].plot([0, top], [0, top], "k:", linewidth=1, label="commanded")
-    axes[0, 0].legend(fontsize=8)
+    _legend(figure, axes[0, 0])
     for axis in axes[1]:
         axis.set_xlabel("commanded speed [m/s]")
     _save(figure, out)
@@ -229,24 +245,20 @@ def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
 
 def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
     """Angular momentum about the vertical of whole body, legs and arms, a panel per method."""
-    size = (4.5 * len(methods), 4)
-    figure, axes = plt.subplots(
-        1, len(methods), figsize=size, sharex=True, sharey=True, squeeze=False
-    )
-    for axis, (method, seeds) in zip(axes[0], methods.items(), strict=True):
+    figure, axes = _panels(len(methods), sharey=True)
+    for axis, (method, seeds) in zip(axes, methods.items(), strict=True):
         for i, (name, label) in enumerate(MOMENTUM):
             _over_commands(axis, label, f"C{i}", seeds, name)
-        axis.set_title(method)
-        axis.set_xlabel("commanded speed [m/s]")
+        axis.set_title(method, fontsize=9)
         axis.grid(alpha=0.3)
-    axes[0, 0].set_ylabel("yaw angular momentum, rms [kg m²/s]")
-    axes[0, 0].set_ylim(bottom=0)
-    axes[0, 0].legend()
+    axes[0].set_ylim(bottom=0)
+    figure.supxlabel("commanded speed [m/s]", fontsize=10)
+    figure.supylabel("yaw angular momentum, rms [kg m²/s]", fontsize=10)
+    _legend(figure, axes[0])
     _save(figure, out)
 
 
 def _save(figure, out: Path) -> None:
-    figure.tight_layout()
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(out, dpi=130)
