@@ -43,7 +43,7 @@ class Args:
     out: Path = Path("runs/compare")
     """One run folder per variant and seed goes in here."""
     keep: Path | None = None
-    """Where to copy what table and figures need of all that is finished in `out`, 50 kB a run."""
+    """Where to copy what table and figures need of all that is finished in `out`, 40 kB a run."""
     variants: tuple[str, ...] = VARIANTS
     """kslc, baseline, and no-PART for each ablation."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -106,28 +106,48 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     from kslc_jax.checkpoint import has_checkpoints
 
     folder = args.out / f"{variant}-seed{seed}"
+    preset = args.baseline if variant == "baseline" else args.preset
+    without = ("--without", ablation) if ablation else ()
+    what = ("--preset", preset, *without, "--seed", str(seed))
     length = ("--steps", str(args.steps), "--run.snapshots", str(args.snapshots))
-    run = ("--run-dir", str(folder), *length)
-    if has_checkpoints(folder):
-        how = ("--resume",)
-    else:
-        preset = args.baseline if variant == "baseline" else args.preset
-        without = ("--without", ablation) if ablation else ()
-        how = ("--preset", preset, *without, "--seed", str(seed))
+    # Told on resume too: train refuses to go on with another preset than it began with.
+    resume = ("--resume",) if has_checkpoints(folder) else ()
+    run = ("--run-dir", str(folder), *length, *resume)
     speeds = ("--speeds", *(f"{v:g}" for v in args.speeds))
     trials = ("--seeds", str(args.trials), "--fidelity", args.fidelity)
     kept = ("--json", str(folder / EVALUATION))
-    return Job(variant, seed, folder, (*how, *run), (str(folder), *speeds, *trials, *kept))
+    return Job(variant, seed, folder, (*what, *run), (str(folder), *speeds, *trials, *kept))
 
 
-def run(job: Job) -> bool:
+def run(job: Job, steps: int) -> bool:
     """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
     a process of its own, whose memory and compiled programs are gone with it."""
     return (
         call("train", job.train)
+        and trained(job.folder) >= steps  # one stopped by a signal has saved, and says all is well
         and call("learning", (str(job.folder),))
         and call("evaluate", job.evaluate)
     )
+
+
+def trained(run: Path) -> int:
+    """Environment steps that a run folder has seen; 0 where it says none."""
+    try:
+        return int(plots.read_metrics(run)["env_steps"][-1])
+    except ValueError:
+        return 0
+
+
+def is_done(job: Job, args: Args) -> bool:
+    """Whether the folder holds the evaluation that is asked for, of a training of that length."""
+    try:
+        kept = json.loads((job.folder / EVALUATION).read_text())
+        speeds = tuple(row["command"] for row in kept["rows"])
+        how = (kept["fidelity"], kept["seeds"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    asked = (args.fidelity, args.trials)
+    return how == asked and speeds == args.speeds and trained(job.folder) >= args.steps
 
 
 def call(module: str, arguments: tuple[str, ...]) -> bool:
@@ -147,11 +167,14 @@ def finished(out: Path) -> list[Path]:
 
 
 def keep(run: Path, folder: Path) -> None:
-    """Copies a finished run's evaluation, its learning curves and, of its metrics, what `plots`
-    reads: every tenth record and those at which the range of commands grew."""
+    """Copies a finished run's evaluation and what `plots` reads of its learning curves and of its
+    metrics: every tenth record, and those at which the range of commands grew."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (EVALUATION, LEARNING):
-        write_whole(folder / name, (run / name).read_text())
+    write_whole(folder / EVALUATION, (run / EVALUATION).read_text())
+    learnt = json.loads((run / LEARNING).read_text())
+    for point in learnt["points"]:
+        point["rows"] = [{n: _short(row[n]) for n in plots.LEARNT} for row in point["rows"]]
+    write_whole(folder / LEARNING, json.dumps(learnt))
     records = plots.read_metrics(run)
     count = len(records["env_steps"])
     kept = sorted({*range(0, count, 10), *plots.growth(records), count - 1})
@@ -164,10 +187,10 @@ def _short(x: float) -> float:
 
 
 def table(runs: Sequence[Path]) -> Table:
-    """Per run the range of commands that it reached, when, and per command its mean forward speed
-    [m/s], or 'falls' where a trial fell."""
+    """Per run its length, the range of commands that it reached and when, and per command its mean
+    forward speed [m/s], or 'falls' where a trial fell."""
     shown = Table(box=box.MARKDOWN)
-    for header in ("run", "v_max [m/s]", "after"):
+    for header in ("run", "steps", "v_max [m/s]", "after"):
         shown.add_column(header, no_wrap=True)
     results = {run: _speeds(run) for run in runs}
     commands = sorted({command for speeds in results.values() for command in speeds})
@@ -186,39 +209,22 @@ def _speeds(run: Path) -> dict[float, str]:
     }
 
 
-def _reached(run: Path) -> tuple[str, str]:
+def _reached(run: Path) -> tuple[str, str, str]:
     records = plots.read_metrics(run)
-    after = "start"
+    length, after = f"{records['env_steps'][-1] / 1e6:.1f} M", "start"
     for _, steps, seconds in plots.milestones(records):
         after = f"{steps / 1e6:.1f} M, {seconds / 60:.0f} min"
-    return f"{records['curriculum/v_max'][-1]:.1f}", after
+    return length, f"{records['curriculum/v_max'][-1]:.1f}", after
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    try:
-        failed = run_all(args)
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
+def report(args: Args) -> None:
+    """The table of what is finished, and a copy where one is wanted; OSError, ValueError."""
     done = finished(args.out)
     print("mean forward speed [m/s] per command:")
     Console(highlight=False, markup=False, width=WIDTH).print(table(done))
-    try:
-        if args.keep:
-            for run_dir in done:
-                keep(run_dir, args.keep / run_dir.name)
-    except OSError as error:
-        print(f"error: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
-        return 1
-    if failed:
-        print(f"error: failed: {', '.join(failed)}; the same command tries again", file=sys.stderr)
-    return 1 if failed else 0
+    if args.keep:
+        for run_dir in done:
+            keep(run_dir, args.keep / run_dir.name)
 
 
 def run_all(args: Args) -> list[str]:
@@ -227,13 +233,37 @@ def run_all(args: Args) -> list[str]:
     todo = list(jobs(args))
     for i, job in enumerate(todo):
         name = job.folder.name
-        if (job.folder / EVALUATION).is_file():
+        if is_done(job, args):
             print(f"[{i + 1}/{len(todo)}] {name}: done before")
             continue
         print(f"[{i + 1}/{len(todo)}] {name}", flush=True)
-        if not run(job):
+        if not run(job, args.steps):
             failed.append(name)
     return failed
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    try:
+        args = tyro.cli(Args, args=argv, description=__doc__)
+        if args.keep:
+            evaluate.require_writable(args.keep / EVALUATION)
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    try:
+        failed = run_all(args)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    try:
+        report(args)
+    except (OSError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    if failed:
+        print(f"error: failed: {', '.join(failed)}; the same command tries again", file=sys.stderr)
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

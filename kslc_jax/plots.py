@@ -37,6 +37,9 @@ PANELS: tuple[tuple[str, str, str], ...] = (
 COLUMNS = ("env_steps", "seconds", *(name for name, _, _ in PANELS))
 """What a metrics.jsonl has to hold."""
 
+LEARNT = ("command", "survival", "forward_mean")
+"""What the rows of a learning.json have to hold."""
+
 EVALUATION = "evaluation.json"
 """What `compare` calls an evaluation in a run folder."""
 

@@ -33,20 +33,24 @@ def test_what_a_job_runs(tmp_path):
 
 
 def test_an_interrupted_training_is_resumed(tmp_path):
+    """With its preset: train refuses to go on with another one than the run began with."""
     args = compare.Args(out=tmp_path, variants=("kslc",))
     (tmp_path / "kslc-seed0" / "checkpoints").mkdir(parents=True)
-    assert "--resume" not in next(compare.jobs(args)).train  # nothing there to go on from
+    begun = next(compare.jobs(args)).train
+    assert "--resume" not in begun  # nothing there to go on from
     (tmp_path / "kslc-seed0" / "checkpoints" / "1" / "params").mkdir(parents=True)
-    job = next(compare.jobs(args))
-    assert job.train[0] == "--resume" and "--preset" not in job.train
+    assert next(compare.jobs(args)).train == (*begun, "--resume")
 
 
-def finished_run(folder, forward=0.97, survival=1.0):
+def finished_run(folder, survival=1.0):
     """A run folder as a job leaves it, of 25 train steps, the range growing at the 14th."""
     folder.mkdir(parents=True)
-    row = {"command": 1.0, "forward_mean": forward, "survival": survival}
-    (folder / compare.EVALUATION).write_text(json.dumps({"rows": [row]}))
-    (folder / compare.LEARNING).write_text("{}")
+    row = {"command": 1.0, "forward_mean": 0.97, "survival": survival}
+    (folder / compare.EVALUATION).write_text(
+        json.dumps({"fidelity": "high", "seeds": 8, "rows": [row]})
+    )
+    point = {"env_steps": 2500000, "rows": [row | {"forward_mean": 2 / 3, "forward_std": 0.1}]}
+    (folder / compare.LEARNING).write_text(json.dumps({"run": folder.name, "points": [point]}))
     records = [
         dict.fromkeys(plots.COLUMNS, 1 / 3)
         | {"env_steps": 1e5 * i, "seconds": 10.0 * i, "curriculum/v_max": 0.5 + (i >= 14)}
@@ -56,16 +60,26 @@ def finished_run(folder, forward=0.97, survival=1.0):
     (folder / "metrics.jsonl").write_text("".join(f"{json.dumps(r)}\n" for r in records))
 
 
-def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, capsys):
-    finished_run(tmp_path / "kslc-seed0")
-    called = []
+ASKED = ("--steps", "2500000", "--speeds", "1.0", "--variants", "kslc")
+"""What `finished_run` is the answer to."""
+
+
+@pytest.fixture
+def called(monkeypatch):
+    """The commands that were run; all fail."""
+    modules = []
 
     def fake(module, arguments):
-        called.append(module)
+        modules.append(module)
         return False
 
     monkeypatch.setattr(compare, "call", fake)
-    argv = ["--out", str(tmp_path), "--variants", "kslc", "baseline", "--seeds", "0"]
+    return modules
+
+
+def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, called, capsys):
+    finished_run(tmp_path / "kslc-seed0")
+    argv = ["--out", str(tmp_path), *ASKED, "baseline", "--seeds", "0"]
     assert compare.main(argv) == 1
     assert called == ["train"]  # of the baseline; no evaluation of a failed training
     out = capsys.readouterr()
@@ -73,30 +87,43 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, monkeypatch, 
     assert "failed: baseline-seed0" in out.err
 
 
+@pytest.mark.parametrize(
+    "other",
+    [("--steps", "2500001"), ("--speeds", "2.0"), ("--trials", "4"), ("--fidelity", "train")],
+)
+def test_an_answer_to_another_question_does_not_count(tmp_path, called, other):
+    finished_run(tmp_path / "kslc-seed0")
+    argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0"]
+    assert compare.main(argv) == 0
+    assert compare.main([*argv, *other]) == 1 and called == ["train"]
+
+
 def test_the_table_of_what_is_finished(tmp_path, capsys):
     finished_run(tmp_path / "kslc-seed0")
     finished_run(tmp_path / "kslc-seed1", survival=0.5)
-    argv = ["--out", str(tmp_path), "--variants", "kslc", "--seeds", "0", "1"]
-    assert compare.main(argv) == 0
+    assert compare.main(["--out", str(tmp_path), *ASKED, "--seeds", "0", "1"]) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
     head, _, first, second = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
-    assert head == ["run", "v_max [m/s]", "after", "1.0"]
-    assert first == ["kslc-seed0", "1.5", "1.4 M, 2 min", "0.97"]
-    assert second == ["kslc-seed1", "1.5", "1.4 M, 2 min", "falls"]
+    assert head == ["run", "steps", "v_max [m/s]", "after", "1.0"]
+    assert first == ["kslc-seed0", "2.5 M", "1.5", "1.4 M, 2 min", "0.97"]
+    assert second == ["kslc-seed1", "2.5 M", "1.5", "1.4 M, 2 min", "falls"]
 
 
 def test_what_is_kept_draws_the_same_figures(tmp_path):
     run, kept = tmp_path / "runs" / "kslc-seed0", tmp_path / "kept"
     finished_run(run)
-    argv = ["--out", str(run.parent), "--keep", str(kept), "--variants", "kslc", "--seeds", "0"]
+    argv = ["--out", str(run.parent), "--keep", str(kept), *ASKED, "--seeds", "0"]
     assert compare.main(argv) == 0
     records, short = plots.read_metrics(run), plots.read_metrics(kept / run.name)
     assert list(short) == list(plots.COLUMNS)
     assert list(short["env_steps"] / 1e5) == [1, 11, 14, 21, 25]
     assert plots.milestones(short) == plots.milestones(records)
     assert list(short["episode_steps"]) == [0.33333] * 5
-    for name in (compare.EVALUATION, compare.LEARNING):
-        assert (kept / run.name / name).read_text() == (run / name).read_text()
+    (curve,) = plots.read_learning([kept / run.name])["kslc"]
+    assert curve.reached == [[0.66667]] and curve.env_steps == [2500000]
+    assert (kept / run.name / compare.EVALUATION).read_text() == (
+        run / compare.EVALUATION
+    ).read_text()
 
 
 def test_keeping_never_writes_into_the_runs(tmp_path, capsys):
@@ -113,9 +140,13 @@ def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
 
     monkeypatch.setattr(compare, "call", fake)
     job = next(compare.jobs(compare.Args(out=tmp_path, variants=("kslc",))))
-    folder = str(tmp_path / "kslc-seed0")
-    assert compare.run(job)
+    finished_run(job.folder)
+    folder = str(job.folder)
+    assert compare.run(job, 2_500_000)
     assert called == [("train", "--preset"), ("learning", folder), ("evaluate", folder)]
+    called.clear()
+    assert not compare.run(job, 2_500_001)  # stopped by a signal: saved, and exit code 0
+    assert called == [("train", "--preset")]
 
 
 def test_an_interrupt_leaves_time_to_save(tmp_path):
