@@ -46,6 +46,15 @@ def init(config: Config) -> Curriculum:
     )
 
 
+def taken_over(config: Config, other: Curriculum) -> Curriculum:
+    """How far another training's curriculum had got, within the limits of this one's; what is left
+    out here (an ablation) stays at its start."""
+    own, limits = init(config), config.curriculum
+    v_max = jnp.minimum(other.v_max, limits.v_limit) if limits.velocity else own.v_max
+    cycle = jnp.maximum(other.cycle_time, limits.cycle_min) if limits.cycle else own.cycle_time
+    return other.replace(v_max=v_max, cycle_time=cycle)
+
+
 def is_fast(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.Array:
     """Whether the commanded vx [m/s] is in the top part of the range."""
     return vx > config.fast_share * state.v_max

@@ -41,6 +41,11 @@ BANDS = {
 LATER = 1.5
 """A milestone may need this many times the stored environment steps: seeds differ by as much."""
 
+
+class Stopped(RuntimeError):
+    """The training was stopped by a signal, and has saved."""
+
+
 Row = tuple[str, float, float, bool]
 """(what, stored, found, agrees)"""
 
@@ -93,7 +98,7 @@ def compare_milestones(old: dict[str, float], new: dict[str, float]) -> list[Row
 
 def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
-    those at which each speed [m/s] was reached."""
+    those at which each speed [m/s] was reached. Raises as `runner.train`, and Stopped."""
     from kslc_jax import plots, runner
     from kslc_jax.checkpoint import has_checkpoints
     from kslc_jax.logs import Progress
@@ -101,7 +106,9 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     run = dataclasses.replace(config.run, steps=round(until))
     config = dataclasses.replace(config, seed=args.seed, run=run)
     going_on = has_checkpoints(args.run_dir)
-    runner.train(config, args.run_dir, going_on, Progress(config))
+    state = runner.train(config, args.run_dir, going_on, Progress(config))
+    if int(state.step) < config.num_updates:
+        raise Stopped("stopped; the same command tries the policy again and goes on training")
     records = plots.read_metrics(args.run_dir)
     return {f"{speed:g}": steps for speed, steps, _ in plots.milestones(records)}
 
@@ -155,12 +162,21 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
     from kslc_jax.checkpoint import CheckpointError
+    from kslc_jax.recovery import NumbersError
     from kslc_jax.run_folder import RunError
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
+        if args.train:
+            runtime.require_good_jax()
         rows = repeat(args)
-    except (CheckpointError, ConfigError, RunError) as error:
+    except Stopped as error:
+        print(error, file=sys.stderr)
+        return 130
+    except NumbersError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except (CheckpointError, ConfigError, RunError, runtime.JaxError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     differing = [what for what, _, _, agrees in rows if not agrees]

@@ -6,6 +6,7 @@ signal, the clock, what is on the disk) they tell each other through `devices`.
 """
 
 import contextlib
+import functools
 import os
 import shlex
 import signal
@@ -107,7 +108,7 @@ def train(
         stack.enter_context(contextlib.closing(disk))
         origin: dict[str, str] = {}
         if start_from is not None:
-            init, origin = _starting_from(start_from, init, disk, mesh)
+            init, origin = _starting_from(start_from, config, init, disk, mesh)
         keeper = devices.on_first(
             lambda: stack.enter_context(_keeper(config, run_dir, resume, origin, progress, disk))
         )
@@ -145,9 +146,10 @@ def _keeper(
 
 
 def _starting_from(
-    path: Path, init: Callable[[], TrainState], disk: Disk, mesh: Mesh | None
+    path: Path, config: Config, init: Callable[[], TrainState], disk: Disk, mesh: Mesh | None
 ) -> tuple[Callable[[], TrainState], dict[str, str]]:
     """`init` with a policy's networks and curriculum, and where they come from."""
+    start = functools.partial(train_step.start_from, config)
     like = jax.eval_shape(init)
     step = 0
 
@@ -156,7 +158,7 @@ def _starting_from(
         policy = disk.load_policy(path)
         step = policy.step
         try:
-            jax.eval_shape(train_step.start_from, like, policy.params, policy.curriculum)
+            jax.eval_shape(start, like, policy.params, policy.curriculum)
         except ValueError as error:
             raise ConfigError(
                 f"cannot start from {path}: it has {error}, see network and env.frames in its "
@@ -167,7 +169,7 @@ def _starting_from(
     params, curriculum = devices.from_first(chosen, (like.learner.params, like.curriculum))
 
     def begin() -> TrainState:
-        state = train_step.start_from(init(), params, curriculum)
+        state = start(init(), params, curriculum)
         return state if mesh is None else devices.place(mesh, state)
 
     return begin, {"start_from": f"{path}, train step {step}"}

@@ -16,6 +16,9 @@ from types import TracebackType
 BAD_JAX = ("0.10.", "0.11.0")
 """JAX versions whose CPU backend can hang for ever in batched Cholesky factorisations."""
 
+JAX_FIX = "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
+"""A JAX that does not, as in pyproject.toml."""
+
 
 def cache_dir() -> Path:
     """Folder of the persistent compilation cache."""
@@ -53,20 +56,21 @@ def auto_preset() -> str:
     return "laptop" if jax.default_backend() == "cpu" else "paper"
 
 
+class JaxError(RuntimeError):
+    """An installed JAX that must not be trained with."""
+
+
 def require_good_jax() -> None:
-    """RuntimeError where the installed JAX is known to hang on this machine."""
+    """JaxError where the installed JAX is known to hang on this machine."""
     import jax
 
     check_jax(jax.__version__, jax.default_backend())
 
 
 def check_jax(version: str, backend: str) -> None:
-    """RuntimeError for versions that hang on this backend, with the fix."""
+    """JaxError for versions that hang on this backend, with the fix."""
     if backend == "cpu" and version.startswith(BAD_JAX):
-        raise RuntimeError(
-            f"jax {version} can hang for ever on a CPU, install another: "
-            "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
-        )
+        raise JaxError(f"jax {version} can hang for ever on a CPU, install another: {JAX_FIX}")
 
 
 class Watchdog:

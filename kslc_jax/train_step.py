@@ -84,13 +84,16 @@ def init(config: Config, seed: int | jax.Array) -> TrainState:
     )
 
 
-def start_from(state: TrainState, params: Params, curriculum: Curriculum) -> TrainState:
+def start_from(
+    config: Config, state: TrainState, params: Params, curriculum: Curriculum
+) -> TrainState:
     """An initial state with the networks of another training, and as far as its curriculum had
     got; ValueError where the networks have other shapes."""
     if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, state.learner.params):
         raise ValueError("networks of other shapes")
     # Copies, for a train step donates its state and another training may start from the same.
     learner = state.learner.replace(params=jax.tree.map(jnp.copy, params))
+    curriculum = curriculum_lib.taken_over(config, curriculum)
     curriculum = jax.tree.map(lambda x, like: x.astype(like.dtype), curriculum, state.curriculum)
     return state.replace(learner=learner, curriculum=curriculum)
 

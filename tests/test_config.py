@@ -253,7 +253,7 @@ def test_debug_is_a_small_laptop():
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("arms", {"env.arms": "held"}),
+        ("arms", {"env.arms": "held", "gait.arm_swing": 0.0, "gait.elbow_bend": 0.0}),
         ("angular-momentum", {"rewards.weights.angular_momentum": 0.0}),
         ("velocity-rewards", {"rewards.velocity_rewards": False}),
         ("velocity-curriculum", {"curriculum.velocity": False, "curriculum.v_start": 3.5}),
@@ -261,8 +261,18 @@ def test_debug_is_a_small_laptop():
     ],
 )
 def test_an_ablation_is_one_switch(base, name, expected):
+    """The reference of `paper` leaves the arms alone: there nothing but `env.arms` changes."""
     found = changes(preset(base), preset(base, (name,)))
-    assert {k: v[1] for k, v in found.items()} == expected
+    here = expected if base == "laptop" else {k: v for k, v in expected.items() if "gait" not in k}
+    assert {k: v[1] for k, v in found.items()} == here
+
+
+def test_held_arms_are_not_asked_to_swing():
+    """The norm of Eq. 8 runs over the arms too: legs could earn nothing by their reference."""
+    held = dataclasses.replace(LAPTOP.env, arms="held")
+    with pytest.raises(ConfigError, match="held arms cannot follow"):
+        dataclasses.replace(LAPTOP, env=held)
+    assert dataclasses.replace(PAPER, env=dataclasses.replace(PAPER.env, arms="held"))
 
 
 def test_all_ablations_at_once():

@@ -40,6 +40,20 @@ def test_start():
     assert int(start.updates) == 0
 
 
+def test_another_trainings_progress_ends_at_the_limits_of_this_one():
+    far = state(v_max=4.5, cycle_time=0.38, tracking=0.8)
+    here = curriculum.taken_over(PAPER, far)
+    assert float(here.v_max) == CONFIG.v_limit == 3.5
+    assert float(here.cycle_time) == pytest.approx(CONFIG.cycle_min)
+    assert float(here.tracking) == pytest.approx(0.8)
+    assert float(curriculum.left(CONFIG, here)) == 0.0  # not below: it scales the entropy bonus
+    near = curriculum.taken_over(PAPER, state(v_max=2.0, cycle_time=0.55))
+    assert float(near.v_max) == 2.0 and float(near.cycle_time) == pytest.approx(0.55)
+    fixed = preset("paper", ("velocity-curriculum", "cycle-curriculum"))
+    here, start = curriculum.taken_over(fixed, near), curriculum.init(fixed)
+    assert (here.v_max, here.cycle_time) == (start.v_max, start.cycle_time)
+
+
 def test_averages_by_hand():
     """0.95 of the old and 0.05 of the new: 0.05 * 0.8 = 0.04; 0.95 * 0.04 + 0.05 * 0.6 = 0.068."""
     one = curriculum.update(CONFIG, state(), progress(0.8, 0.4, 3, 200.0, 2))

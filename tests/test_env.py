@@ -98,8 +98,8 @@ def test_delay_and_noise(debug):
     assert float(jnp.mean(jnp.std(applied, axis=1) / per_env)) == pytest.approx(0.02, abs=0.002)
 
 
-def test_held_arms_ignore_actions(debug):
-    held = dataclasses.replace(debug, env=dataclasses.replace(debug.env, arms="held"))
+def test_held_arms_ignore_actions():
+    held = preset("debug", ("arms",))
     applied = env._applied_action(held, jnp.ones(16), jnp.ones(16), 1.0, jax.random.key(0))
     assert not np.any(applied[12:]) and np.all(applied[:12])
 

@@ -33,7 +33,7 @@ RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
 ROBOTS = 8
 STEPPED = PhysicsConfig(engine="mujoco", timestep=0.001, decimation=10)
-"""The runner's physics: no joint speed is cut, the motors' law alone holds it at 1 ms."""
+"""The runner's physics: joint by joint on the host, at high fidelity's 1 ms."""
 
 
 @functools.cache
@@ -49,7 +49,7 @@ def make_policy(kind):
             config,
             env=dataclasses.replace(config.env, arms="held"),
             network=dataclasses.replace(config.network, symmetric=False),
-            gait=paper.gait,
+            gait=paper.gait,  # without a reference for the arms
             command=paper.command,
         )
     config = dataclasses.replace(config, physics=PhysicsConfig(engine="mujoco"))

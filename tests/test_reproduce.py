@@ -2,13 +2,15 @@
 
 import json
 import math
+import types
 
 import jax
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, reproduce
+from kslc_jax import checkpoint, curriculum, networks, plots, reproduce, runner, runtime
 from kslc_jax.config import preset
+from kslc_jax.recovery import NumbersError
 
 
 @pytest.fixture
@@ -75,3 +77,47 @@ def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(reproduce, "retrain", fake)
     assert reproduce.main(["still", "--train", "--run-dir", str(tmp_path / "run")]) == 0
     assert asked == [3000.0]
+
+
+@pytest.fixture
+def trained(shipped, monkeypatch):
+    """What a training of `shipped` does: begins with train step 1, and ends as told."""
+    (shipped / reproduce.EVALUATION).write_text(evaluation(0.0))
+    (shipped / reproduce.MILESTONES).write_text(json.dumps({"1": 2000}))
+    outcome = {"steps": 1.0, "raises": None}
+
+    def fake(config, run_dir, resume, progress):
+        progress.close()
+        if outcome["raises"]:
+            raise outcome["raises"]
+        run_dir.mkdir(parents=True)
+        rows = [
+            dict.fromkeys(plots.COLUMNS, 0.0) | {"env_steps": steps, "curriculum/v_max": v}
+            for steps, v in ((128, 0.5), (2900, 1.0))
+        ]
+        (run_dir / "metrics.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+        return types.SimpleNamespace(step=round(outcome["steps"] * config.num_updates))
+
+    monkeypatch.setattr(runner, "train", fake)
+    return outcome
+
+
+@pytest.mark.parametrize(
+    ("outcome", "code", "says"),
+    [
+        ({}, 0, "all 3 numbers lie within"),
+        ({"steps": 0.5}, 130, "stopped; the same command"),
+        ({"raises": NumbersError("bad again and again")}, 1, "error: bad again and again"),
+    ],
+)
+def test_how_a_training_ends(trained, tmp_path, outcome, code, says, capsys):
+    trained |= outcome
+    assert reproduce.main(["still", "--train", "--run-dir", str(tmp_path / "run")]) == code
+    said = capsys.readouterr()
+    assert says in (said.err or said.out).splitlines()[-1]
+
+
+def test_a_jax_that_hangs_is_refused(shipped, monkeypatch, capsys):
+    monkeypatch.setattr(jax, "__version__", "0.11.0")
+    assert reproduce.main(["still", "--train"]) == 2
+    assert runtime.JAX_FIX in capsys.readouterr().err

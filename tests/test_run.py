@@ -182,7 +182,7 @@ def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
     old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
     checkpoint.save_policy(old, tmp_path / "p")
     init, _ = train_step.make(preset("debug"))
-    begin, origin = runner._starting_from(tmp_path / "p", init, disk.Disk(), None)
+    begin, origin = runner._starting_from(tmp_path / "p", preset("debug"), init, disk.Disk(), None)
     state = begin()
     for a, b in zip(
         jax.tree.leaves(state.learner.params), jax.tree.leaves(old.params), strict=True
@@ -407,8 +407,8 @@ def test_git_is_not_needed(monkeypatch):
 
 
 def test_every_field_can_be_overridden():
-    args = train.parse([*DEBUG, "--rewards.weights.joint-pos", "2.5", "--env.arms", "held"])
-    assert args.config.rewards.weights.joint_pos == 2.5 and args.config.env.arms == "held"
+    args = train.parse([*DEBUG, "--rewards.weights.joint-pos", "2.5", "--gait.no-random-phase"])
+    assert args.config.rewards.weights.joint_pos == 2.5 and not args.config.gait.random_phase
     args = train.parse([*DEBUG, "--network.actor", "8", "4", "--randomize.kp", "0.8", "1.2"])
     assert args.config.network.actor == (8, 4) and args.config.randomize.kp == (0.8, 1.2)
     args = train.parse([*DEBUG, "--without", "arms", "cycle-curriculum", "--seed", "3"])

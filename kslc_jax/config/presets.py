@@ -124,9 +124,10 @@ PRESETS: dict[str, Config] = {
     "baseline-laptop": _override(_BASELINE, **_LAPTOP_LEARNER),
 }
 
-# The paper's ablations: one switch each, on any preset.
+# The paper's ablations: one switch each, on any preset. Held arms also leave the gait's reference:
+# they cannot follow it, and the norm of Eq. 8 would pay the legs nothing for following theirs.
 ABLATIONS: dict[str, dict[str, Any]] = {
-    "arms": {"env": {"arms": "held"}},
+    "arms": {"env": {"arms": "held"}, "gait": {"arm_swing": 0.0, "elbow_bend": 0.0}},
     "angular-momentum": {"rewards": {"weights": {"angular_momentum": 0.0}}},
     "velocity-rewards": {"rewards": {"velocity_rewards": False}},
     "velocity-curriculum": {"curriculum": {"velocity": False, "v_start": 3.5}},

@@ -117,7 +117,8 @@ class EnvConfig:
     privileged_frames: int = 3
     """Frames of critic history (paper, Table I)."""
     arms: Literal["free", "held"] = "free"
-    """held: arm actions are ignored and the arms servo to zero (ablation, baseline)."""
+    """held: arm actions are ignored and the arms servo to zero (ablation, baseline); the gait's
+    reference must then not move them."""
     reset_joint_noise: float = 0.1
     """Initial joint angles are default + U(-x, x) [rad] (HG)."""
 
@@ -498,6 +499,11 @@ class Config:
         require(
             self.batch_size < COUNTER,
             f"env.num_envs x ppo.rollout_steps: {self.batch_size} samples are more than 2^31",
+        )
+        require(
+            self.env.arms == "free" or self.gait.arm_swing == self.gait.elbow_bend == 0.0,
+            "env.arms: held arms cannot follow gait.arm_swing and gait.elbow_bend, set both to 0 "
+            "(--without arms does)",
         )
         require(
             self.curriculum.cycle_min <= self.gait.cycle_time,
