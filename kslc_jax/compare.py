@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, plots
+from kslc_jax import evaluate, plots, runtime
 from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.learning import LEARNING
 from kslc_jax.logs import METRICS, write_whole
@@ -244,6 +244,7 @@ def run_all(args: Args) -> list[str]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    runtime.prepare()  # before JAX, whose own choice of what to say the children would inherit
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
         if args.keep:

@@ -28,7 +28,7 @@ class Progress:
     tracking_count: jax.Array  # [] number of those
     fast_tracking: jax.Array  # [] mean over the fast commands' samples
     fast_count: jax.Array  # [] number of those samples
-    episode_steps: jax.Array  # [] mean length of the episodes that ended
+    episode_steps: jax.Array  # [] mean length of the episodes that ended; see train_step.init
     episode_count: jax.Array  # [] number of those
     gait: jax.Array  # [] mean of the feet_contact_number term over the fast commands' samples
 

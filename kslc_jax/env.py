@@ -53,7 +53,7 @@ class Outcome:
     tracking: jax.Array  # [] tracking_lin_vel, share of its maximum
     settled: jax.Array  # [] bool: the command has been the same for a while
     fast: jax.Array  # [] bool: and it was in the top part of the range
-    episode_steps: jax.Array  # [] int, length of the episode so far
+    episode_steps: jax.Array  # [] int, length of the episode so far; see train_step.init
     speeding: jax.Array  # [] bool: some joint is at its speed limit, or over it
 
 
@@ -121,39 +121,8 @@ def step(
     cycle = gait.cycle_time(config.gait, command, curriculum.cycle_time, curriculum.v_max)
     gait_now = gait.update(config.gait, state.gait, now, command, cycle, config.control_dt)
 
+    outcome = _outcome(config, state, action, now, gait_now, command, broken, curriculum)
     time = state.time + 1
-    terminated = now.torso_contact | broken
-    truncated = (time >= config.episode_steps) & ~terminated
-    reward, terms = rewards.evaluate(
-        config.rewards,
-        robot,
-        config.control_dt,
-        rewards.Inputs(
-            signals=now,
-            gait=gait_now,
-            command=command,
-            reference=gait.reference_pose(config.gait, robot, gait_now, command),
-            action=action,
-            last_action=state.last_action,
-            last_last_action=state.last_last_action,
-            last_joint_vel=state.physics.qvel[6:],
-            last_base_velocity=state.last_base_velocity,
-            v_max=curriculum.v_max,
-        ),
-    )
-    settled = _command_age(config, state.time) >= config.curriculum.settle_seconds
-    outcome = Outcome(
-        reward=jnp.where(broken, 0.0, reward),
-        terminated=terminated,
-        truncated=truncated,
-        broken=broken,
-        terms=terms,
-        tracking=terms["tracking_lin_vel"],
-        settled=settled,
-        fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
-        episode_steps=time,
-        speeding=jnp.any(jnp.abs(now.joint_vel) >= robot.speed_limit),
-    )
     state = state.replace(
         physics=new,
         gait=gait_now,
@@ -166,7 +135,54 @@ def step(
     state = _push(config, state, keys[2])
     state = _observe(config, state, signals.read(robot, state.physics), keys[3])
     fresh = reset(config, keys[4], curriculum)
-    return maths.tree_where(terminated | truncated, fresh, state), outcome
+    return maths.tree_where(outcome.terminated | outcome.truncated, fresh, state), outcome
+
+
+def _outcome(
+    config: Config,
+    before: EnvState,
+    action: jax.Array,
+    now: Signals,
+    gait_now: GaitState,
+    command: Command,
+    broken: jax.Array,
+    curriculum: Curriculum,
+) -> Outcome:
+    """Whether the episode ended with the step that led from `before` to `now`, and what the step
+    was worth under the `command` that the policy saw, with its yaw rate as it is now (HG)."""
+    robot = physics.robot_for(config.physics)
+    time = before.time + 1
+    terminated = now.torso_contact | broken
+    reward, terms = rewards.evaluate(
+        config.rewards,
+        robot,
+        config.control_dt,
+        rewards.Inputs(
+            signals=now,
+            gait=gait_now,
+            command=command,
+            reference=gait.reference_pose(config.gait, robot, gait_now, command),
+            action=action,
+            last_action=before.last_action,
+            last_last_action=before.last_last_action,
+            last_joint_vel=before.physics.qvel[6:],
+            last_base_velocity=before.last_base_velocity,
+            v_max=curriculum.v_max,
+        ),
+    )
+    settled = _command_age(config, before.time) >= config.curriculum.settle_seconds
+    return Outcome(
+        reward=jnp.where(broken, 0.0, reward),
+        terminated=terminated,
+        truncated=(time >= config.episode_steps) & ~terminated,
+        broken=broken,
+        terms=terms,
+        tracking=terms["tracking_lin_vel"],
+        settled=settled,
+        fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
+        episode_steps=time,
+        speeding=jnp.any(jnp.abs(now.joint_vel) >= robot.speed_limit),
+    )
 
 
 def _applied_action(

@@ -18,7 +18,7 @@ from pathlib import Path
 import tyro
 
 from kslc_jax import runtime
-from kslc_jax.config import ConfigError, Fidelity
+from kslc_jax.config import ConfigError, Fidelity, require_seed
 
 HEADLINE = (
     ("survival", "survived", "{:.0%}"),
@@ -70,6 +70,7 @@ class Args:
 
     def __post_init__(self):
         check(self.speeds, self.seeds, self.seconds)
+        require_seed(self.seed)
 
 
 def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
@@ -141,7 +142,7 @@ def measure(
 
 
 def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, float]]:
-    """One row of metrics per commanded speed, with `forward_mean_ci` over seeds."""
+    """One row of metrics per commanded speed."""
     from kslc_jax import trials
 
     engine = trials.engine(policy, args.fidelity)

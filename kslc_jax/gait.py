@@ -39,7 +39,8 @@ class GaitState:
 
 
 def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array) -> GaitState:
-    """Gait memory at the start of an episode; `foot_z` [2, m] is where the feet rest."""
+    """Gait memory at the start of an episode; `foot_z` [2, m] is where the feet are: heights count
+    from there until they have touched the ground."""
     phase = jax.random.uniform(key) if config.random_phase else jnp.zeros(())
     clock, stance = _clock(config, phase, command)
     zeros = jnp.zeros(2)

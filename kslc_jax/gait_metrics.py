@@ -17,7 +17,7 @@ SETTLE = 2.0
 """Seconds at the start that do not count: the robot gathers speed."""
 
 RESTING = 0.1
-"""Mean forward speed [m/s] below which there is no transport to have a cost."""
+"""Mean forward speed [m/s] below which there is no transport to have a cost, and no stride."""
 
 MOMENTUM_EVERY = 0.05
 """Seconds between the samples of the limbs' angular momentum."""
@@ -46,12 +46,14 @@ def _difference(left: float, right: float) -> float:
     return abs(left - right) / max(0.5 * (abs(left) + abs(right)), 1e-6)
 
 
-def _interval(per_trial: np.ndarray) -> float:
-    """Half width of the 95 % confidence interval of a mean over trials (Student's t); 0 of one."""
+def _interval(name: str, per_trial: np.ndarray) -> dict[str, float]:
+    """Half width of the 95 % confidence interval of a mean over trials (Student's t), as NAME_ci;
+    one trial has none."""
     count = len(per_trial)
     if count < 2:
-        return 0.0
-    return float(stdtrit(count - 1, 0.975) * per_trial.std(ddof=1) / np.sqrt(count))
+        return {}
+    half = stdtrit(count - 1, 0.975) * per_trial.std(ddof=1) / np.sqrt(count)
+    return {f"{name}_ci": float(half)}
 
 
 def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
@@ -62,7 +64,7 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
     out = {
         "survival": float(upright.mean()),
         "forward_mean": float(mean.mean()),
-        "forward_mean_ci": _interval(mean),
+        **_interval("forward_mean", mean),
         "forward_rmse": float(np.sqrt(np.mean((mean - command) ** 2))),
     }
     s = _steady(trace, dt)
@@ -76,7 +78,8 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
             "yaw_rate_std": angvel[..., 2].std(0),
         }
         out |= {name: float(x.mean()) for name, x in swings.items()}
-        out |= {f"{name}_ci": _interval(x) for name, x in swings.items()}
+        for name, x in swings.items():
+            out |= _interval(name, x)
         out |= {
             "forward_bias": float(mean[upright].mean() - command),
             "roll_deg": float(np.degrees(np.abs(s.euler[..., 0]).mean())),
@@ -98,8 +101,9 @@ def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     forward = np.asarray(s.linvel[..., 0])
     moved = GRAVITY * abs(float((s.mass * forward).mean()))
     load = np.abs(s.torque) / robot.effort_limit
-    transport = float(power / moved) if abs(forward.mean()) > RESTING else None
-    return ({} if transport is None else {"cost_of_transport": transport}) | {
+    goes = abs(forward.mean()) > RESTING
+    transport = {"cost_of_transport": float(power / moved)} if goes else {}
+    return transport | {
         "within_speed_limits": float((np.abs(s.joint_vel) <= robot.speed_limit).all(-1).mean()),
         "peak_torque_share": float(load.max()),
         "mean_torque_share": float(load.mean()),
@@ -123,10 +127,11 @@ def strides(trace: Trace, dt: float) -> dict[str, float]:
         float(np.percentile(s.foot_height[..., i], 95) - np.percentile(s.foot_height[..., i], 5))
         for i in (0, 1)
     ]
-    stance = s.contact.mean((0, 1))
+    stance, forward = s.contact.mean((0, 1)), float(s.linvel[..., 0].mean())
+    length = {"stride_length": forward / max(frequency, 1e-3)} if abs(forward) > RESTING else {}
     return {
         "stride_frequency": frequency,
-        "stride_length": float(s.linvel[..., 0].mean() / max(frequency, 1e-3)),
+        **length,
         "flight_share": float((~s.contact.any(-1)).mean()),
         "double_support_share": float(s.contact.all(-1).mean()),
         "clearance": min(swing_top),

@@ -243,18 +243,15 @@ def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 # -------------------------------------------------------------------------------------- mujoco
 
-_batches: dict[tuple[int, int, int], mujoco.batch.Batch] = {}
+_batches: dict[tuple[Robot, int, int], mujoco.batch.Batch] = {}
 _batches_lock = threading.Lock()
 
 
-def _batch(robot: Robot, size: int, threads: int, fields: tuple[str, ...]) -> mujoco.batch.Batch:
+def _batch(robot: Robot, size: int, threads: int) -> mujoco.batch.Batch:
     """The cached simulator batch of this size; its state is overwritten at every call."""
-    key = (id(robot), size, threads)
+    key = (robot, size, threads)
     if key not in _batches:
-        batch = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
-        for name in fields:
-            batch.expand(name)
-        _batches[key] = batch
+        _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
     return _batches[key]
 
 
@@ -295,7 +292,7 @@ def _host_step(
     state, dynamics, fields = jax.tree.map(rows, (state, dynamics, fields))
     target = rows(target)
     with _batches_lock:
-        batch = _batch(robot, len(target), config.threads, tuple(fields))
+        batch = _batch(robot, len(target), config.threads)
         for name, value in fields.items():
             batch.expand(name)[:] = value
         qpos, qvel, warmstart = (batch.bind(n) for n in ("qpos", "qvel", "qacc_warmstart"))

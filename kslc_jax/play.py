@@ -19,9 +19,12 @@ from pathlib import Path
 import tyro
 
 from kslc_jax import evaluate, runtime, sim2sim
-from kslc_jax.config import ConfigError, Fidelity
+from kslc_jax.config import ConfigError, Fidelity, require_seed
 
 FPS = 50
+
+STRIPS = (".png", ".jpg")
+FILMS = (".mp4", ".mkv", ".mov")
 
 SPEED_SECONDS = 0.5
 """Span over which the speed written into the video is taken."""
@@ -57,6 +60,12 @@ class Args:
             raise ConfigError("seconds must be positive")
         if not (self.speeds and all(map(math.isfinite, self.speeds))):
             raise ConfigError("speeds: name at least one, finite")
+        require_seed(self.seed)
+        for path, kinds in ((self.gait_strip, STRIPS), (self.video, FILMS)):
+            if path is not None and path.suffix.lower() not in kinds:
+                raise ConfigError(f"{path}: its name must end in {' or '.join(kinds)}")
+        if self.engine != "mujoco" and self.fidelity != "high":
+            raise ConfigError(f"engine: {self.engine} takes the robot at --fidelity high only")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
         if self.live and self.engine != "mujoco":

@@ -117,6 +117,7 @@ def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, flo
         try:
             content = json.loads(path.read_text())
             rows = content["rows"] if "rows" in content else content["conditions"]["nominal"]
+            _ = [float(row["command"]) for row in rows]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is no evaluation (of evaluate or sim2sim --json)") from error
         name = path.resolve().parent.name if path.name == EVALUATION else path.stem
@@ -315,6 +316,8 @@ class Momentum:
 
 def draw(args: Training | Learning | Performance | Momentum) -> None:
     """Draws the asked figure; ValueError where the data is missing."""
+    if not (args.runs if isinstance(args, Training | Learning) else args.evaluations):
+        raise ValueError("name at least one file or run folder")
     match args:
         case Training():
             _training(args)

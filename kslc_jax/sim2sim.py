@@ -16,6 +16,7 @@ Examples:
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import sys
@@ -27,7 +28,7 @@ from typing import Any, Literal
 import tyro
 
 from kslc_jax import evaluate, runtime
-from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig
+from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig, require_seed
 
 Engine = Literal["mujoco", "drake"]
 
@@ -86,13 +87,15 @@ class Args:
 
     def __post_init__(self):
         evaluate.check(self.speeds, self.seeds, self.seconds)
+        require_seed(self.seed)
         for name in self.conditions:
             changes(name)
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """What to run, the unperturbed robot first."""
-        return ("nominal", *(ALL if self.perturb == ("all",) else self.perturb))
+        asked = (ALL if name == "all" else (name,) for name in self.perturb)
+        return tuple(dict.fromkeys(("nominal", *itertools.chain(*asked))))
 
 
 def changes(condition: str) -> dict[str, Any]:

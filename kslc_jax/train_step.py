@@ -68,8 +68,8 @@ def _jitted(config: Config):
 
 
 def init(config: Config, seed: int | jax.Array) -> TrainState:
-    """The state before the first train step. Episodes start at random ages, so that their ends
-    are spread evenly from the start."""
+    """The state before the first train step. Its episodes have random ages, so that their ends are
+    spread evenly from the start; the lengths that they are said to have had include those."""
     key, key_params, key_env, key_time = jax.random.split(jax.random.key(seed), 4)
     curriculum = curriculum_lib.init(config)
     env_keys = jax.random.split(key_env, config.env.num_envs)

@@ -23,6 +23,10 @@ NOMINAL = RandomizeConfig(
 """No randomisation: friction 1, the robot as described, no pushes."""
 
 
+FARTHEST = 3.0
+"""How far [rad] a wanted heading lies ahead of the robot at most."""
+
+
 @dataclass(frozen=True)
 class Setting:
     """Under what conditions a policy is tried."""
@@ -81,10 +85,11 @@ def hold(
 ) -> env.EnvState:
     """The environment under the command `velocity` [3]: vx, vy [m/s], yaw rate [rad/s].
 
-    A wanted yaw rate moves the heading ahead of the robot; without one it is `heading` [rad].
+    A wanted yaw rate moves the heading ahead of the robot, by less than half a turn, beyond which
+    it would turn the other way; without one it is `heading` [rad].
     """
     yaw = signals.read(physics.robot_for(config.physics), state.physics).base_euler[2]
-    ahead = yaw + velocity[2] / config.command.heading_gain
+    ahead = yaw + jnp.clip(velocity[2] / config.command.heading_gain, -FARTHEST, FARTHEST)
     heading = jnp.where(velocity[2] == 0.0, heading, ahead)
     command = commands.with_velocity(config.command, state.command, velocity)
     return state.replace(command=command.replace(heading=heading))
@@ -94,6 +99,9 @@ def run(
     policy: Policy, setting: Setting, velocities: np.ndarray, seed: int = 0, chunk: float = 1.0
 ) -> Iterator[Trace]:
     """Tries one command per environment; yields the trace in pieces of `chunk` seconds.
+
+    The command holds from the first step on; the one frame before it, the reset's, shows whatever
+    command was drawn there.
 
     Args:
       policy: acts deterministically.

@@ -255,6 +255,10 @@ class TestPolicyCommands:
     def test_seconds(self, main, more, policy, value):
         assert "seconds" in refused(main, policy, *more, f"--seconds={value}")
 
+    @pytest.mark.parametrize("value", [-1, 2**31, 10**20])
+    def test_seed(self, main, more, policy, value):
+        assert "seed" in refused(main, policy, *more, f"--seed={value}")
+
     def test_no_speeds(self, main, more, policy):
         assert "speeds" in refused(main, policy, *more, "--speeds")
 
@@ -269,6 +273,17 @@ class TestPolicyCommands:
         (tmp_path / "params").mkdir()
         (tmp_path / "params" / "x").write_bytes(b"\x80\x04junk")
         assert str(tmp_path) in refused(main, tmp_path, *more)
+
+
+class TestPlay:
+    @few
+    @given(word=words, option=st.sampled_from(["--gait-strip", "--video"]))
+    def test_suffix(self, policy, run_dir, word, option):
+        assert word in refused(play.main, policy, option, run_dir / f"x.{word}")
+
+    def test_drake_has_no_training_engine(self, policy):
+        said = refused(play.main, policy, *PICTURE, "--engine", "drake", "--fidelity", "train")
+        assert "--fidelity high" in said
 
 
 class TestExport:
@@ -335,6 +350,15 @@ class TestReproduce:
 
 
 class TestPlots:
+    @pytest.mark.parametrize("figure", ["training", "learning", "performance", "momentum"])
+    def test_no_files(self, figure):
+        assert "name at least one" in refused(plots.main, figure)
+
+    def test_rows_without_a_command(self, run_dir):
+        (run_dir / "evaluation.json").write_text('{"rows": [{"survival": 1.0}]}')
+        said = refused(plots.main, "momentum", run_dir / "evaluation.json")
+        assert "is no evaluation" in said
+
     def rows(self, folder: Path, content: bytes) -> Path:
         (folder / "metrics.jsonl").write_bytes(content)
         return folder

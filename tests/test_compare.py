@@ -98,6 +98,13 @@ def test_an_answer_to_another_question_does_not_count(tmp_path, called, other):
     assert compare.main([*argv, *other]) == 1 and called == ["train"]
 
 
+def test_the_children_are_as_quiet_as_each_command_alone(tmp_path, called, monkeypatch):
+    """They inherit what XLA is told to say, which JAX sets itself where nobody has."""
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    compare.main(["--out", str(tmp_path), *ASKED, "--seeds", "0"])
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+
+
 def test_the_table_of_what_is_finished(tmp_path, capsys):
     finished_run(tmp_path / "kslc-seed0")
     finished_run(tmp_path / "kslc-seed1", survival=0.5)

@@ -118,6 +118,15 @@ def test_what_the_paper_leaves_to_humanoid_gym():
     assert (w.lateral_distance, w.lean_per_speed) == (False, 0.0)
 
 
+def test_our_additions_are_off_in_the_paper():
+    assert PAPER.rewards.weights.tracking_mean_vel == PAPER.rewards.restless == 0.0
+    assert not PAPER.rewards.clearance_mid_swing and not PAPER.ppo.entropy_fades
+    assert (PAPER.gait.stride_sweep, PAPER.gait.double_support_at_speed) == (0.0, 0.1)
+    assert PAPER.command.slow_fraction == PAPER.curriculum.settle_seconds == 0.0
+    assert PAPER.curriculum.gait_threshold == -1.0  # never below: feet_contact_number ends at -0.3
+    assert PAPER.network.init_mean == 1.0 and PAPER.randomize.noise == (1.0, 1.0)
+
+
 def test_physics_departs_from_humanoid_gym_at_the_same_control_rate():
     p = PAPER.physics
     assert (p.timestep, p.decimation, p.iterations, p.ls_iterations) == (0.005, 2, 4, 5)
@@ -465,6 +474,9 @@ def test_unknown_names(name, without, message):
         ("ppo", "desired_kl", 0.0),
         ("ppo", "learning_rate_factor", 0.0),
         ("ppo", "learning_rate_bounds", (1e-2, 1e-5)),
+        ("ppo", "learning_rate_bounds", (-1e-2, 1.0)),
+        ("command", "heading_gain", 0.0),
+        ("command", "max_yaw_rate", 0.0),
         ("run", "steps", 0),
         ("run", "log_every", 0),
         ("run", "checkpoint_minutes", 0.0),

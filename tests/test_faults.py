@@ -703,7 +703,7 @@ class TestDeterminism:
             monkeypatch.setattr(
                 physics,
                 "_batch",
-                lambda robot, size, _, fields, n=threads: real(robot, size, n, fields),
+                lambda robot, size, _, n=threads: real(robot, size, n),
             )
             rows.append(twenty_steps(init, step))
             assert any(key[2] == threads for key in physics._batches)

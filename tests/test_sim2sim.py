@@ -104,6 +104,8 @@ def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
 
 def test_all_runs_ten_perturbations_after_the_nominal_robot():
     conditions = sim2sim.Args("x", perturb=("all",)).conditions
+    more = sim2sim.Args("x", perturb=("all", "friction=0.2", "payload=5")).conditions
+    assert more == (*conditions, "friction=0.2")  # payload=5 is one of the ten
     assert conditions[0] == "nominal" and len(set(conditions)) == 11
 
 

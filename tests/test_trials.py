@@ -3,11 +3,22 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, evaluate, gait_metrics, networks, trials
+from kslc_jax import (
+    checkpoint,
+    commands,
+    curriculum,
+    env,
+    evaluate,
+    gait_metrics,
+    networks,
+    observations,
+    trials,
+)
 from kslc_jax.config import HighFidelity, PhysicsConfig, preset
 
 DT = 0.01
@@ -39,6 +50,33 @@ def test_commands_hold(still):
     config = trials.trial_config(still.config, setting, 2)
     assert config.command.resample_seconds >= 10.0 and config.env.noise_level == 0.0
     assert config.randomize.push_seconds == 0.0
+    step = jax.jit(env.step, static_argnums=0)
+    at = observations.slices(observations.ACTOR)["command"]
+    for wanted in ([1.5, 0.0, 0.0], [0.5, -0.3, 0.0], [1.0, 0.0, 0.4]):
+        state = env.reset(config, jax.random.key(1), still.curriculum)
+        for _ in range(3):
+            state = trials.hold(config, state, jnp.array(wanted))
+            state, _ = step(config, state, jnp.zeros(16), jax.random.key(2), still.curriculum)
+            seen = state.history[-1, at] / np.array([2.0, 2.0, 1.0])
+            np.testing.assert_allclose(seen, wanted, atol=0.01)  # what one step turns the robot
+
+
+@pytest.mark.parametrize("rate", [0.3, 3.0, -3.0])
+def test_a_yaw_rate_never_turns_the_other_way(still, rate):
+    """A rate of 3 rad/s would ask for a heading 6 rad ahead, which is 0.28 rad behind."""
+    state = env.reset(still.config, jax.random.key(1), still.curriculum)
+    held = trials.hold(still.config, state, jnp.array([0.0, 0.0, rate]))
+    steered = commands.steer(still.config.command, held.command, jnp.zeros(()))
+    assert float(steered.velocity[2]) == pytest.approx(np.clip(rate, -1.0, 1.0), abs=1e-5)
+
+
+def test_one_trial_has_no_interval_and_a_rest_no_stride(xbot):
+    trace = synthetic()
+    one = jax.tree.map(lambda x: x[:, :1], trace)
+    assert "forward_mean_ci" in gait_metrics.speed(trace, 2.0, DT)
+    assert not [name for name in gait_metrics.speed(one, 2.0, DT) if name.endswith("_ci")]
+    rest = trace.replace(linvel=0.01 * trace.linvel)
+    assert "stride_length" not in gait_metrics.strides(rest, DT)
 
 
 def synthetic(seconds=11.6, frequency=1.25, speed=2.0):

@@ -162,7 +162,8 @@ class CommandConfig:
     def __post_init__(self):
         _check_range("command.vy", self.vy)
         _check_range("command.heading", self.heading)
-        require(self.resample_seconds > 0, "command.resample_seconds must be positive")
+        for name in ("resample_seconds", "heading_gain", "max_yaw_rate"):
+            require(getattr(self, name) > 0, f"command.{name} must be positive")
         require(
             0 <= self.stand_fraction + self.forward_fraction <= 1,
             "command.stand_fraction + command.forward_fraction must lie in [0, 1]",
@@ -445,6 +446,7 @@ class PPOConfig:
         require(self.learning_rate_factor >= 1, "ppo.learning_rate_factor must be at least 1")
         _check_range("ppo.learning_rate_bounds", self.learning_rate_bounds)
         low, high = self.learning_rate_bounds
+        require(low > 0, "ppo.learning_rate_bounds must be positive")
         require(low <= self.learning_rate <= high, "ppo.learning_rate must lie within its bounds")
 
 
