@@ -324,8 +324,8 @@ def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch
     monkeypatch.setattr(kslc_jax, "render", SimpleNamespace(), raising=False)
     monkeypatch.setattr(play, "record", None)
     (tmp_path / "file").touch()
-    for name in ("gait_strip", "video"):
-        args = play.Args(Path("x"), **{name: tmp_path / "file" / "out"})
+    for name, out in (("gait_strip", "out.png"), ("video", "out.mp4")):
+        args = play.Args(Path("x"), **{name: tmp_path / "file" / out})
         with pytest.raises(ConfigError, match="cannot write"):
             play.draw(args, None)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
