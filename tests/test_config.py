@@ -20,6 +20,7 @@ from kslc_jax.config import (
     preset,
     to_dict,
 )
+from kslc_jax.config.storage import YOUNGER
 
 PAPER = preset("paper")
 LAPTOP = preset("laptop")
@@ -499,3 +500,9 @@ def test_batch_must_split_into_minibatches():
 def test_seed_must_not_be_negative():
     with pytest.raises(ConfigError, match="seed"):
         Config(seed=-1)
+
+
+@pytest.mark.parametrize("path", YOUNGER)
+def test_fields_that_older_files_lack_are_off(path):
+    back = from_dict(edited(path.removeprefix("config."), remove=True))
+    assert back == PAPER and back.run == PAPER.run

@@ -209,3 +209,74 @@ def test_frames_hold_what_the_state_holds(setting):
     np.testing.assert_allclose(critic["friction"][0], state.dynamics.friction, rtol=1e-6)
     mass = 21.081917 + state.dynamics.base_mass
     np.testing.assert_allclose(critic["base_mass"][0], mass / 30.0, rtol=1e-5)
+
+
+def test_the_engine_steps_the_robot_of_the_episode(setting):
+    """Its dynamics, not the nominal ones, and the ground's friction."""
+    config, reset, _ = setting
+    state, given = reset(jax.random.key(0)), []
+
+    def simulate(physics_config, state, target, dynamics, ground_friction):
+        given.append((dynamics, ground_friction))
+        return state
+
+    cur = curriculum.init(config)
+    env.step(config, state, jnp.zeros(16), jax.random.key(1), cur, simulate)
+    ((dynamics, ground),) = given
+    assert dynamics is state.dynamics and ground == config.randomize.ground_friction == 0.6
+    assert float(dynamics.base_mass) != 0.0
+
+
+def test_commands_come_from_the_curriculums_range(setting):
+    config, _, _ = setting
+    cur = curriculum.init(config).replace(v_max=jnp.asarray(1.5))
+    draw = jax.jit(jax.vmap(lambda key: env.reset(config, key, cur).command.velocity[0]))
+    vx = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
+    assert vx.min() < -0.28 and 1.45 < vx.max() <= 1.5
+
+
+def test_rewards_compare_with_the_steps_before(setting):
+    """Velocities of the step before, actions of the two before."""
+    config, reset, step = setting
+    robot = physics.robot_for(config.physics)
+    a = np.asarray(0.3 * jax.random.normal(jax.random.key(2), (3, 16)))
+    states = [reset(jax.random.key(0))]
+    for action in a:
+        state, out = step(states[-1], jnp.asarray(action), jax.random.key(1))
+        states.append(state)
+    before, now = states[-2:]
+    was, base = (np.asarray(signals.read(robot, s.physics).base_velocity) for s in (before, now))
+    expected = {
+        "dof_acc": np.sum(((now.physics.qvel[6:] - before.physics.qvel[6:]) / 0.01) ** 2),
+        "base_acc": np.exp(-3.0 * np.linalg.norm(base - was)),
+        "action_smoothness": np.sum((a[2] - a[1]) ** 2)
+        + np.sum((a[2] + a[0] - 2 * a[1]) ** 2)
+        + 0.05 * np.sum(np.abs(a[2])),
+    }
+    for name, value in expected.items():
+        assert float(out.terms[name]) == pytest.approx(float(value), rel=1e-3), name
+
+
+def test_a_step_pushes_and_the_critic_sees_it(debug):
+    """Both ways, up to 0.2 m/s and 0.4 rad/s; frames are of after the push."""
+    cur = curriculum.init(debug)
+    state = env.reset(debug, jax.random.key(0), cur).replace(time=jnp.asarray(399))
+    step = jax.jit(jax.vmap(lambda key: env.step(debug, state, jnp.zeros(16), key, cur)[0]))
+    new = step(jax.random.split(jax.random.key(1), 300))
+    push, seen = np.asarray(new.push), np.asarray(new.privileged_history[:, -1])
+    np.testing.assert_allclose(np.abs(push).max(0), [0.2, 0.2, 0.4, 0.4, 0.4], rtol=0.05)
+    assert np.all(np.abs(push.mean(0)) < 0.06)
+    at = observations.slices(observations.CRITIC)
+    np.testing.assert_allclose(seen[:, at["push_linear"]], push[:, :2], atol=1e-6)
+    np.testing.assert_allclose(seen[:, at["base_angvel"]], new.physics.qvel[:, 3:6], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("vx", "time", "fast"), [(0.4, 300, True), (0.25, 300, False), (0.4, 100, False)]
+)
+def test_fast_is_settled_and_in_the_top_of_the_range(setting, vx, time, fast):
+    _, reset, step = setting
+    state = reset(jax.random.key(3))
+    asked = state.command.replace(velocity=jnp.array([vx, 0.0, 0.0]))
+    state = state.replace(command=asked, time=jnp.asarray(time))
+    assert bool(step(state, jnp.zeros(16), jax.random.key(4))[1].fast) == fast

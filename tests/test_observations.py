@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -357,3 +358,33 @@ def test_mirrored_physics_gives_the_mirrored_frame(xbot):
 def test_mirror_of_the_joints_is_the_robots():
     permutation, sign = robot.mirror_joints()
     assert permutation.tolist() == PARTNER and sign.tolist() == [-1.0] * 16
+
+
+def test_signals_are_what_they_are_called(xbot):
+    """By hand, of a robot turned and moving at random."""
+    rng = np.random.default_rng(0)
+    quat = rng.normal(size=4)
+    quat /= np.linalg.norm(quat)
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, quat)
+    turn = turn.reshape(3, 3)
+    linear, rate, q, dq = (rng.normal(size=n) for n in (3, 3, 16, 16))
+    qpos, qvel = jnp.asarray(np.r_[1, 2, 3, quat, q]), jnp.asarray(np.r_[linear, rate, dq])
+    data = np.arange(xbot.mj_model.nsensordata) + 0.5
+    data[xbot.sensor("left_foot_touch")], data[xbot.sensor("right_foot_touch")] = 4.9, 5.1
+    state = initial_state(PhysicsConfig(), qpos, qvel)
+    state = state.replace(sensordata=jnp.asarray(data), torque=jnp.arange(16.0))
+    now = signals.read(xbot, state)
+
+    def both(name):
+        return [data[xbot.sensor(f"{side}_{name}")] for side in ("left", "right")]
+
+    expected = {
+        **{"joint_pos": q, "joint_vel": dq, "torque": np.arange(16.0), "base_angvel": rate},
+        **{"base_linvel": turn.T @ linear, "base_velocity": np.r_[linear, turn @ rate]},
+        **{"gravity": -turn[2], "foot_pos": both("foot_pos"), "foot_vel": both("foot_linvel")},
+        **{"knee_pos": both("knee_pos"), "foot_force": [4.9, 5.1]},
+        **{"foot_contact": [False, True], "angular_momentum": data[xbot.sensor("angmom")]},
+    }
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(now, name), value, atol=1e-5, err_msg=name)

@@ -139,6 +139,10 @@ class TestLoss:
     def loss(self, params, batch):
         return ppo.loss(CONFIG, bandit_apply, DRAWN, params, batch)
 
+    def test_total(self):
+        total, info = self.loss(params(mean=0.3, value=1.0), samples())
+        assert total == pytest.approx(info["policy_loss"] + CONFIG.value_coef * info["value_loss"])
+
     def test_ratio_one(self):
         info = self.loss(params(), samples())[1]
         assert info["policy_loss"] == pytest.approx(0.0, abs=1e-6)  # -(1 - 1) / 2
@@ -206,3 +210,16 @@ def test_update_finds_the_best_action_of_a_bandit():
         learner = iterate(learner, key)
     assert learner.params["mean"] == pytest.approx(2.0, abs=0.15)
     assert jnp.exp(learner.params["log_std"][0]) < 0.6
+    assert learner.params["value"] == pytest.approx(0.0, abs=0.1)  # -(a - 2)^2 where a is 2
+
+
+def test_normalised_over_the_valid_samples():
+    got = ppo._normalise(jnp.array([1.0, 3.0, 1e6]), jnp.array([True, True, False]))
+    np.testing.assert_allclose(got[:2], [-1.0, 1.0], rtol=1e-5)
+
+
+def test_a_lowered_ceiling_rises_by_two_percent_an_update():
+    config = PPOConfig(minibatches=1)
+    low = ppo.init(config, params()).replace(rate_ceiling=jnp.asarray(1e-3))
+    new, _ = ppo.update(config, bandit_apply, DRAWN, low, samples(), jax.random.key(0))
+    assert float(new.rate_ceiling) == pytest.approx(1.02e-3)

@@ -315,6 +315,13 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         {"foot_pos": [[-0.15, 0.6, 0.05], [0, 0, 0.05]], "base_euler": [0, 0, np.pi / 2]},
         0.50336897,
     ),
+    # Heading 45 degrees to the left: aside is (-1, 1) / sqrt 2.
+    (
+        "feet_distance",
+        LATERAL,
+        {"foot_pos": [[-0.212132, 0.212132, 0.05], [0, 0, 0.05]], "base_euler": [0, 0, np.pi / 4]},
+        1.0,
+    ),
     # 0.01 outside 0.2 to 0.25: (1 + e^-1) / 2.
     ("knee_distance", KSLC, {}, 1.0),
     ("knee_distance", KSLC, {"knee_pos": [[0, 0.13, 0.4], [0, -0.13, 0.4]]}, 0.68393972),

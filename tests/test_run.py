@@ -95,6 +95,7 @@ def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
     cli(*DEBUG, "--run-dir", tmp_path / "r", "--steps", 512)
     cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1024)
     assert numbers(records(tmp_path / "r")) == numbers(records(run_dir))
+    assert np.all(np.diff([row["seconds"] for row in records(tmp_path / "r")]) > 0.0)
     a, b = restored(run_dir), restored(tmp_path / "r")
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -474,3 +475,9 @@ def test_progress_prints_a_line_without_a_terminal(capsys):
     Progress(preset("debug")).show(record)
     out = capsys.readouterr().out
     assert "steps/s 1" in out and "v_max 0.5 m/s" in out and len(out.splitlines()) == 1
+
+
+def test_snapshots_come_in_the_order_of_their_steps(tmp_path):
+    for step in (100, 1000, 200):
+        (tmp_path / "snapshots" / str(step)).mkdir(parents=True)
+    assert [path.name for path in learning.snapshots(tmp_path)] == ["100", "200", "1000"]

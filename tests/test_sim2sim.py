@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -180,3 +181,9 @@ def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
     monkeypatch.delattr(kslc_jax, "drake", raising=False)
     assert sim2sim.main(["x", "--engine", "drake"]) == 2
     assert "pip install 'kslc_jax[drake]'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["noise", "latency"])
+def test_a_condition_that_is_asked_for_is_set(name):
+    setting = sim2sim.setting(sim2sim.Args(Path("x"), **{name: True}), "payload=5")
+    assert (setting.noise, setting.latency) == (name == "noise", name == "latency")

@@ -140,3 +140,63 @@ def test_small_training_earns_more_and_more():
         state, metrics = step(state)
         rewards.append(float(metrics["reward"]))
     assert np.mean(rewards[-10:]) > 1.1 * np.mean(rewards[5:15])
+
+
+def test_what_update_and_curriculum_are_given(made, monkeypatch):
+    """Samples are seen by the update as they were by the rollout; advantages and the curriculum's
+    averages by hand. Half of the episodes end at the time limit in mid-rollout, one robot is
+    broken from the start."""
+    config, init, _ = made
+
+    def update(ppo_config, apply, drawn, learner, samples, key):
+        return learner, {"samples": samples, "seen": apply(learner.params, samples.index)}
+
+    monkeypatch.setattr(train_step.ppo, "update", update)
+    monkeypatch.setattr(
+        train_step, "_metrics", lambda c, new, out, p, losses: losses | {"outcome": out}
+    )
+    state, n = init(), config.env.num_envs
+    half, old = jnp.arange(n) < n // 2, state.env
+    time = jnp.where(half, config.episode_steps - 4, 296).at[0].set(196)  # settled from 200 on
+    vx = old.command.velocity.at[:, 0].set(0.2 + 0.3 * half)
+    old = old.replace(
+        time=time,
+        history=jax.random.normal(jax.random.key(1), old.history.shape),
+        privileged_history=jax.random.normal(jax.random.key(2), old.privileged_history.shape),
+        command=old.command.replace(velocity=vx),
+        physics=old.physics.replace(qvel=old.physics.qvel.at[-1, 8].set(jnp.nan)),
+    )
+    new, got = jax.jit(lambda s: train_step.step(config, s))(state.replace(env=old))
+    dist, value = got["seen"]
+    np.testing.assert_allclose(dist.mean, got["samples"].mean, atol=1e-5)
+    np.testing.assert_allclose(value, got["samples"].value, atol=1e-5)
+    log_prob = dist.log_prob(got["samples"].action)
+    np.testing.assert_allclose(log_prob, got["samples"].log_prob, atol=1e-3)
+    samples, out = jax.tree.map(np.asarray, (got["samples"], got["outcome"]))
+    value, advantage = samples.value.reshape(-1, n), samples.advantage.reshape(-1, n)
+    last = np.asarray(networks.value(config, new.learner.params, new.env.privileged_history))
+    assert out.broken.sum() == 1 and np.array_equal(samples.valid, ~out.broken.ravel())
+    following, done = np.r_[value[1:], last[None]], out.terminated | out.truncated
+    assert out.truncated.sum() == n // 2 - 1 and 0 < out.fast.sum() < out.settled.sum()
+    delta = out.reward + 0.994 * np.where(out.truncated, value, following * ~done) - value
+    trace = np.zeros(n)
+    for t in reversed(range(len(value))):
+        trace = delta[t] + 0.994 * 0.9 * ~done[t] * trace
+        np.testing.assert_allclose(advantage[t], trace, atol=1e-4)
+    for name, x, mask in (
+        ("tracking", out.tracking, out.settled),
+        ("fast_tracking", out.tracking, out.fast),
+        ("episode_steps", out.episode_steps, done),
+        ("gait", out.terms["feet_contact_number"], out.fast),
+    ):
+        average = float(getattr(new.curriculum, name))  # starts at 0, of which it keeps 0.95
+        assert average == pytest.approx(0.05 * x[mask & ~out.broken].mean(), rel=1e-4), name
+    assert int(new.curriculum.updates) == 1
+    keys = [jax.random.key_data(train_step.step_keys(x)[0]) for x in (state, new)]
+    assert not np.array_equal(*keys)
+
+
+def test_robots_start_unlike_each_other(made):
+    env = made[1]().env
+    assert len(np.unique(env.dynamics.friction)) == len(np.unique(env.time)) == 16
+    assert len(np.unique(env.command.heading)) > 8

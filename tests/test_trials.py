@@ -1,6 +1,8 @@
 """Trials of a policy under fixed commands, and the numbers drawn from them."""
 
+import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -217,3 +219,81 @@ def test_speed_as_a_word_exits_with_2():
     with pytest.raises(SystemExit) as stop:
         evaluate.main(["x", "--speeds", "fast"])
     assert stop.value.code == 2
+
+
+def test_a_row_is_of_its_command_and_conditions(still, monkeypatch):
+    asked = []
+
+    def run(policy, setting, velocities, seed):
+        asked.append((setting, seed))
+        alive, moves = np.ones((300, len(velocities)), bool), np.tile(velocities, (300, 1, 1))
+        yield synthetic(3.0).replace(alive=alive, linvel=moves)
+
+    monkeypatch.setattr(trials, "run", run)
+    monkeypatch.setattr(
+        gait_metrics, "summary", lambda trace, *_: {"vx": trace.linvel[..., 0].mean()}
+    )
+    args = evaluate.Args(
+        Path("x"), (0.5, 2.0), seeds=3, seconds=3.0, fidelity="high", noise=True, seed=5
+    )
+    assert evaluate.sweep(args, still) == [{"command": v, "vx": v} for v in (0.5, 2.0)]
+    ((setting, seed),) = asked
+    assert setting.physics == HighFidelity() and setting.noise and seed == 5
+    evaluate.sweep(dataclasses.replace(args, fidelity="train", noise=False), still)
+    assert asked[1][0] == trials.Setting(still.config.physics, seconds=3.0)
+
+
+def test_speed_numbers():
+    """2 s at rest that do not count, then 1 and 3 m/s +- 0.5, +- 0.2 aside, +- 0.4 rad/s."""
+    trace = synthetic()
+    sign = np.where(np.arange(len(trace.alive)) % 2, 1.0, -1.0)[:, None] * np.ones(2)
+    linvel = np.stack([np.array([1.0, 3.0]) + 0.5 * sign, 0.2 * sign, 9.0 * sign], -1)
+    linvel[:200] = 0.0
+    angvel = np.stack([9.0 * sign, 9.0 * sign, 0.4 * sign], -1)
+    euler = np.zeros_like(linvel) + np.array([-0.02, 0.1, 3.0])
+    m = gait_metrics.speed(trace.replace(linvel=linvel, angvel=angvel, euler=euler), 1.0, DT)
+    expected = {
+        **{"forward_mean": 2.0, "forward_rmse": 2**0.5, "forward_bias": 1.0},
+        **{"forward_std": 0.5, "lateral_std": 0.2, "yaw_rate_std": 0.4},
+        **{"roll_deg": 1.145916, "pitch_deg": 5.729578},
+        "forward_mean_ci": 12.7062,  # t of one degree of freedom x sqrt(2) / sqrt(2)
+    }
+    for name, value in expected.items():
+        assert m[name] == pytest.approx(value, rel=1e-4), name
+
+
+def test_effort_and_strides_by_hand(xbot):
+    trace = synthetic()
+    torque, joint_vel = 0 * trace.torque, 0 * trace.joint_vel
+    torque[..., 3], joint_vel[::4, :, 3] = -0.5 * xbot.effort_limit[3], -12.5
+    m = gait_metrics.effort(trace.replace(torque=torque, joint_vel=joint_vel), xbot, DT)
+    assert m["within_speed_limits"] == pytest.approx(0.75, abs=0.01)
+    assert m["peak_torque_share"] == pytest.approx(0.5)
+    assert m["mean_torque_share"] == pytest.approx(0.5 / 16)
+    s = gait_metrics.strides(trace.replace(foot_height=trace.foot_height * [1.0, 0.5]), DT)
+    assert s["clearance"] == pytest.approx(0.05) and s["double_support_share"] == 0.0
+    assert s["clearance_difference"] == pytest.approx(0.05 / 0.075)
+
+
+def test_limbs_turn_with_the_body(xbot):
+    """1 rad/s about the vertical: their moments of inertia about it, arms held out."""
+    trace = synthetic(3.0)
+    qpos = 0.0 * trace.qpos
+    qpos[..., 3] = 1.0
+    spin = trace.angvel + np.array([0.0, 0.0, 1.0])
+    m = gait_metrics.momentum(
+        trace.replace(qpos=qpos, linvel=0 * trace.linvel, angvel=spin), xbot, DT
+    )
+    assert m["legs_momentum_yaw_rms"] == pytest.approx(0.448, abs=0.01)
+    assert m["arms_momentum_yaw_rms"] == pytest.approx(0.603, abs=0.01)
+
+
+def test_the_shipped_policy_walks_and_runs():
+    """4 s, of which 2 s count: at 3 m/s it is still gathering speed."""
+    policy = checkpoint.load_policy("xbot_l_run")
+    args = evaluate.Args(Path("xbot_l_run"), speeds=(1.0, 3.0), seeds=1, seconds=4.0)
+    walk, run = evaluate.sweep(args, policy)
+    assert walk["survival"] == run["survival"] == 1.0
+    assert walk["forward_mean"] == pytest.approx(1.0, abs=0.1)
+    assert run["forward_mean"] == pytest.approx(2.83, abs=0.2)
+    assert run["flight_share"] > 0.1 and run["shoulder_hip_correlation"] < -0.8
