@@ -95,7 +95,8 @@ def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
     cli(*DEBUG, "--run-dir", tmp_path / "r", "--steps", 512)
     cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1024)
     assert numbers(records(tmp_path / "r")) == numbers(records(run_dir))
-    assert np.all(np.diff([row["seconds"] for row in records(tmp_path / "r")]) > 0.0)
+    rows = map(json.loads, (tmp_path / "r" / "metrics.jsonl").read_text().splitlines())
+    assert np.all(np.diff([row["seconds"] for row in rows]) > 0.0)  # the clock goes on, too
     a, b = restored(run_dir), restored(tmp_path / "r")
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
