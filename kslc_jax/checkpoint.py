@@ -33,6 +33,7 @@ from kslc_jax import networks, observations
 from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
 FOLDER = "checkpoints"
@@ -50,11 +51,6 @@ OLDER_POLICIES = (1,)
 
 class CheckpointError(RuntimeError):
     """A checkpoint that is missing, damaged or of another config; the message says which."""
-
-
-def first_line(error: Exception) -> str:
-    """The first line of an error's message, cut to what fits a terminal."""
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def is_key(x: Any) -> bool:

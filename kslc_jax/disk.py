@@ -18,8 +18,9 @@ import jax
 import numpy as np
 
 from kslc_jax import checkpoint, runtime, train_step
-from kslc_jax.checkpoint import CheckpointError, Policy, Store, first_line, host_array, typed
+from kslc_jax.checkpoint import CheckpointError, Policy, Store, host_array, typed
 from kslc_jax.config import Config
+from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
 

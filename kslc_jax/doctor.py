@@ -170,8 +170,6 @@ def check() -> int:
     from rich.console import Console
     from rich.table import Table
 
-    from kslc_jax.checkpoint import first_line
-
     table = Table(title="kslc_jax on this machine", title_justify="left")
     for column in ("check", "result", "found", "fix"):
         table.add_column(column, overflow="fold")
@@ -181,7 +179,7 @@ def check() -> int:
             table.add_row(name, "[green]pass", look(), "")
         except Exception as error:  # whatever is wrong with this machine
             failed += 1
-            table.add_row(name, "[red]FAIL", first_line(error), fix)
+            table.add_row(name, "[red]FAIL", runtime.first_line(error), fix)
     Console(highlight=False).print(table)
     return 1 if failed else 0
 

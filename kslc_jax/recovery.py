@@ -16,8 +16,9 @@ import numpy as np
 
 from kslc_jax import config as config_lib
 from kslc_jax import train_step
-from kslc_jax.checkpoint import CheckpointError, first_line, host_array, typed
+from kslc_jax.checkpoint import CheckpointError, host_array, typed
 from kslc_jax.config import Config
+from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
 PATIENCE = 10

@@ -36,6 +36,7 @@ import mujoco  # noqa: E402
 import numpy as np  # noqa: E402
 
 from kslc_jax import robot as robot_lib  # noqa: E402
+from kslc_jax.runtime import first_line  # noqa: E402
 
 LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
@@ -49,10 +50,9 @@ def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mu
     try:
         return mujoco.Renderer(model, height, width, **more)
     except Exception as error:  # each GL fails in its own way
-        why = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise RenderError(
-            f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({why}); try the other of "
-            "egl and osmesa"
+            f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({first_line(error)}); "
+            "try the other of egl and osmesa"
         ) from error
 
 

@@ -16,9 +16,9 @@ import jax
 
 from kslc_jax import checkpoint
 from kslc_jax import config as config_lib
-from kslc_jax.checkpoint import first_line
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.logs import rows_written, write_whole
+from kslc_jax.runtime import first_line
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 

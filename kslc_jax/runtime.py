@@ -49,6 +49,11 @@ def _unraisablehook(args: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(args)
 
 
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, cut to what fits a terminal."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
 def auto_preset() -> str:
     """'paper' where JAX has an accelerator, 'laptop' without one."""
     import jax

@@ -659,6 +659,14 @@ class TestDoctor:
         out = capsys.readouterr().out
         assert "FAIL" in out and "division by zero" in out and "install another" in out
 
+    def test_a_package_that_cannot_be_imported_is_no_traceback(self, monkeypatch, capsys):
+        """The table is there for machines where JAX or orbax is broken."""
+        for name in ("jax", "orbax.checkpoint", "kslc_jax.checkpoint"):
+            monkeypatch.setitem(sys.modules, name, None)
+        monkeypatch.setattr(doctor, "CHECKS", (("jax", doctor.check_jax, "install another"),))
+        assert doctor.main(["check"]) == 1
+        assert "install another" in capsys.readouterr().out
+
     def test_what_is_quick_passes_here(self):
         for check in (doctor.check_python, doctor.check_jax, doctor.check_cores):
             assert check()
