@@ -16,7 +16,6 @@ Examples:
 """
 
 import dataclasses
-import itertools
 import json
 import math
 import sys
@@ -94,8 +93,8 @@ class Args:
     @property
     def conditions(self) -> tuple[str, ...]:
         """What to run, the unperturbed robot first."""
-        asked = (ALL if name == "all" else (name,) for name in self.perturb)
-        return tuple(dict.fromkeys(("nominal", *itertools.chain(*asked))))
+        asked = (c for name in self.perturb for c in (ALL if name == "all" else (name,)))
+        return tuple(dict.fromkeys(("nominal", *asked)))
 
 
 def changes(condition: str) -> dict[str, Any]:
