@@ -1,7 +1,8 @@
 """The robot: our MJCF of XBot-L, and everything the rest asks of it by name.
 
-Two fidelities come from the one file: "train", where only the feet meet the floor, and "high", for
-evaluation: 1 ms, elliptic cones, converged solver, self-collision, joint friction.
+Two fidelities come from the one file: "train", where the soles meet the floor and the lower legs
+each other, and "high", for evaluation: 1 ms, elliptic cones, converged solver, collision of all
+parts, joint friction.
 """
 
 import functools
@@ -18,6 +19,8 @@ MODEL_PATH = Path(__file__).parent / "assets" / "xbot_l.xml"
 _FLOOR_BIT, _PART_BIT = 1, 2
 _DECOR_GROUP = 1
 """Geom group of shapes that never collide."""
+_BUMPER_GROUP = 5
+"""Geom group of the feet's stand-ins in training, never drawn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +132,8 @@ def _raise_fidelity(spec: mujoco.MjSpec) -> None:
     spec.option.iterations = 100
     spec.option.ls_iterations = 50
     spec.option.tolerance = 1e-10
+    for stand_in in (*spec.pairs, *(g for g in spec.geoms if g.group == _BUMPER_GROUP)):
+        spec.delete(stand_in)
     sole = next(g for g in spec.geoms if g.priority > 0)
     friction, priority = sole.friction.copy(), sole.priority
     for geom in spec.geoms:

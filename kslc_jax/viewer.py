@@ -175,7 +175,8 @@ class Viewer:
         self._name = next(iter(self._policies))
         loaded = load_policy(policy)
         self.server = serve(host, port)
-        self.figure = Figure(self.server, robot_lib.load(fidelity).mj_model)
+        # Whatever is simulated: the training model has shapes that are not to be seen.
+        self.figure = Figure(self.server, robot_lib.load("high").mj_model)
         self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
         self._rng = np.random.default_rng(seed)
         self._play(loaded)

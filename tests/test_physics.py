@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import physics, randomize, robot
+from kslc_jax import maths, physics, randomize, robot
 from kslc_jax.config import HighFidelity, PhysicsConfig, RandomizeConfig
 
 ENGINES = ("mjx", "mujoco")
@@ -228,6 +228,20 @@ def test_torques_and_sensors_agree(runs):
     for name, tolerance in (("torque", 1e-2), ("sensordata", 1e-1)):
         a, b = (getattr(runs[engine][9], name) for engine in ENGINES)
         assert np.median(np.abs(a - b).max(axis=1)) < tolerance
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_legs_do_not_pass_through_each_other(engine):
+    """In the air, both hips told to close: the feet come to rest side by side."""
+    qpos = jnp.asarray(robot.load().default_qpos, jnp.float32).at[2].set(5.0)
+    state = physics.initial_state(PhysicsConfig(engine=engine), qpos, jnp.zeros(22))
+    step = make_step(engine)
+    closed = jnp.zeros(16).at[jnp.array([0, 6])].set(jnp.array([-0.3, 0.3]))
+    for _ in range(40):
+        state = step(state, closed, randomize.nominal())
+    feet = [state.sensordata[robot.load().sensor(f"{s}_foot_pos")] for s in ("left", "right")]
+    across = maths.quat_rotate_inverse(state.qpos[3:7], feet[0] - feet[1])[1]
+    assert 0.07 < across < 0.12
 
 
 def test_threads_do_not_change_results():

@@ -245,7 +245,7 @@ def test_angular_momentum_is_eq_3(xbot):
         np.testing.assert_allclose(data.sensordata[xbot.sensor("angmom")], total, atol=1e-4)
 
 
-def test_only_soles_and_floor_can_meet_in_training(xbot):
+def test_only_soles_can_meet_the_floor_in_training(xbot):
     m = xbot.mj_model
     robots = m.geom_bodyid > 0
     meets = [m.geom(i).name for i in np.flatnonzero(robots & (m.geom_contype > 0))]
@@ -317,8 +317,8 @@ def test_high_fidelity_options():
     assert m.body_subtreemass[0] == pytest.approx(53.036, abs=1e-3)
 
 
-def high_contacts(q, height=2.0):
-    model = robot.load("high").mj_model
+def contacts(q, fidelity="high", height=2.0):
+    model = robot.load(fidelity).mj_model
     data = mujoco.MjData(model)
     data.qpos[:] = robot.load().default_qpos
     data.qpos[2], data.qpos[7:] = height, q
@@ -326,20 +326,48 @@ def high_contacts(q, height=2.0):
     return {frozenset((model.geom(c.geom1).name, model.geom(c.geom2).name)) for c in data.contact}
 
 
+@pytest.mark.parametrize("roll", np.linspace(0.0, 0.3, 13))
+def test_in_training_feet_and_shanks_meet_as_at_high_fidelity(roll):
+    """Legs that close like scissors: capsules stand in for the feet's boxes, to within 5 mm."""
+    closed = np.zeros(16)
+    closed[[0, 6]] = -roll, roll
+    found = {fidelity: contacts(closed, fidelity) for fidelity in ("train", "high")}
+    feet, shanks = ({f"left_{part}", f"right_{part}"} for part in ("foot", "shank"))
+    assert (shanks in found["train"]) == (shanks in found["high"])
+    assert ({"left_bumper", "right_bumper"} in found["train"]) == (feet in found["high"])
+    assert bool(found["train"]) == bool(found["high"])
+
+
+def test_bumpers_are_as_wide_and_as_long_as_the_feet(xbot):
+    for side in ("left", "right"):
+        bumper = xbot.mj_model.geom(f"{side}_bumper")
+        box = robot.load("high").mj_model.geom(f"{side}_foot")
+        radius, half_length, _ = bumper.size
+        assert radius == pytest.approx(box.size[1])
+        assert radius + half_length == pytest.approx(box.size[0])
+        np.testing.assert_allclose(bumper.pos, box.pos)
+
+
+def test_stand_ins_are_gone_at_high_fidelity():
+    m = robot.load("high").mj_model
+    assert m.npair == 0
+    assert not any("bumper" in m.geom(i).name for i in range(m.ngeom))
+
+
 def test_high_fidelity_self_collision(xbot):
-    assert not high_contacts(np.zeros(16))
+    assert not contacts(np.zeros(16))
     rng = np.random.default_rng(2)
     for _ in range(50):  # one leg alone never touches itself
         q = np.zeros(16)
         q[2:5] = rng.uniform([-1.2, -0.9, -0.6], [0.6, 0.6, 0.6])
         q[8:11] = -q[2:5]
-        assert not high_contacts(q)
+        assert not contacts(q)
     toes_in = np.zeros(16)
     toes_in[[1, 7]] = [0.9, -0.9]
-    assert frozenset(("left_foot", "right_foot")) in high_contacts(toes_in)
+    assert frozenset(("left_foot", "right_foot")) in contacts(toes_in)
     crossed = np.zeros(16)
     crossed[[0, 6]] = [-0.4, 0.4]
-    assert any("left" in " ".join(p) and "right" in " ".join(p) for p in high_contacts(crossed))
+    assert any("left" in " ".join(p) and "right" in " ".join(p) for p in contacts(crossed))
 
 
 @pytest.mark.parametrize(("first", "sign"), [(0, 1), (6, -1)])
@@ -351,7 +379,7 @@ def test_a_walking_leg_touches_nothing_but_perhaps_a_hand(first, sign):
     for _ in range(200):
         q = np.zeros(16)
         q[first : first + 6] = sign * rng.uniform(low, high)
-        touching = high_contacts(q)
+        touching = contacts(q)
         assert all(any("hand" in name for name in pair) for pair in touching), (q, touching)
 
 
@@ -380,9 +408,9 @@ def test_only_at_high_fidelity_a_fallen_robot_lies_on_its_trunk(fidelity):
 
 
 def test_high_fidelity_floor_meets_all_parts():
-    lying = high_contacts(np.zeros(16), height=0.1)
+    lying = contacts(np.zeros(16), height=0.1)
     assert {frozenset(("floor", part)) for part in ("pelvis", "left_hand", "left_shank")} <= lying
-    feet = high_contacts(np.zeros(16), height=0.88)
+    feet = contacts(np.zeros(16), height=0.88)
     assert feet == {frozenset(("floor", "left_foot")), frozenset(("floor", "right_foot"))}
 
 

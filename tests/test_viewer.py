@@ -19,7 +19,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 import kslc_jax
-from kslc_jax import checkpoint, config, curriculum, networks, play, session, trials
+from kslc_jax import checkpoint, config, curriculum, networks, play, robot, session, trials
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
@@ -125,9 +125,9 @@ def volume(model, geom) -> float:
     }[kinds(model.geom_type[geom])]
 
 
-def test_meshes_have_the_geoms_size_and_place(xbot):
+def test_meshes_have_the_geoms_size_and_place():
     viewer = pytest.importorskip("kslc_jax.viewer", reason="the extra 'viewer' is not installed")
-    model = xbot.mj_model
+    model = robot.load("high").mj_model
     drawn = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     assert len(drawn) > 40
     for geom in drawn:
