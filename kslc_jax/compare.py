@@ -113,7 +113,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     # Told on resume too: train refuses to go on with another preset than it began with.
     resume = ("--resume",) if has_checkpoints(folder) else ()
     run = ("--run-dir", str(folder), *length, *resume)
-    speeds = ("--speeds", *(f"{v:g}" for v in args.speeds))
+    speeds = ("--speeds", *map(str, args.speeds))
     trials = ("--seeds", str(args.trials), "--fidelity", args.fidelity)
     kept = ("--json", str(folder / EVALUATION))
     return Job(variant, seed, folder, (*what, *run), (str(folder), *speeds, *trials, *kept))
@@ -122,6 +122,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 def run(job: Job, steps: int) -> bool:
     """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
     a process of its own, whose memory and compiled programs are gone with it."""
+    (job.folder / EVALUATION).unlink(missing_ok=True)  # not of what is trained now
     return (
         call("train", job.train)
         and trained(job.folder) >= steps  # one stopped by a signal has saved, and says all is well

@@ -14,11 +14,13 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from kslc_jax import runtime
 from kslc_jax.config import ConfigError, Fidelity, require_seed
+from kslc_jax.logs import write_whole
 
 HEADLINE = (
     ("survival", "survived", "{:.0%}"),
@@ -93,6 +95,15 @@ def require_writable(path: Path | None) -> None:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         raise ConfigError(f"cannot write {path}")
+
+
+def write(path: Path, content: dict[str, Any]) -> None:
+    """Keeps numbers as JSON; ConfigError where that fails, and then the old file is still whole."""
+    special = path.exists() and not path.is_file()  # /dev/stdout
+    try:
+        (Path.write_text if special else write_whole)(path, json.dumps(content, indent=1))
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
 
 
 def measure(
@@ -201,7 +212,7 @@ def _report(args: Args) -> None:
     if args.json is not None:
         what = {"policy": str(args.policy), "step": policy.step}
         how = {n: getattr(args, n) for n in ("fidelity", "seeds", "seconds", "noise", "seed")}
-        args.json.write_text(json.dumps({**what, **how, "rows": rows}, indent=1))
+        write(args.json, {**what, **how, "rows": rows})
 
 
 if __name__ == "__main__":

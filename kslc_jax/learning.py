@@ -9,7 +9,6 @@ Examples:
   python -m kslc_jax.plots learning runs/laptop-seed0 runs/laptop-seed1 --out learning.png
 """
 
-import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,13 +97,10 @@ def main(argv: list[str] | None = None) -> int:
             for run in args.runs:
                 task = bar.add_task(str(run), total=1.0)
                 found = curve(run, args, lambda done, task=task: bar.update(task, completed=done))
-                (run / LEARNING).write_text(json.dumps(found, indent=1))
+                evaluate.write(run / LEARNING, found)
                 bar.console.print(f"wrote {run / LEARNING}")
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
-    except OSError as error:
-        print(f"error: cannot write {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     return 0
 

@@ -16,7 +16,6 @@ Examples:
 """
 
 import dataclasses
-import json
 import math
 import sys
 from collections.abc import Callable
@@ -220,7 +219,7 @@ def _report(args: Args) -> None:
         what = {"policy": str(args.policy), "step": policy.step}
         names = ("engine", "seeds", "seconds", "noise", "latency", "seed")
         how = {name: getattr(args, name) for name in names}
-        args.json.write_text(json.dumps({**what, **how, "conditions": results}, indent=1))
+        evaluate.write(args.json, {**what, **how, "conditions": results})
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@ traceback, and nothing on disk touched."""
 
 import contextlib
 import copy
+import errno
 import io
 import json
 import string
@@ -31,7 +32,7 @@ from kslc_jax import (
     train,
     train_step,
 )
-from kslc_jax.config import PRESETS, preset, to_dict
+from kslc_jax.config import PRESETS, ConfigError, preset, to_dict
 
 few = settings(
     max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -273,6 +274,21 @@ class TestPolicyCommands:
         (tmp_path / "params").mkdir()
         (tmp_path / "params" / "x").write_bytes(b"\x80\x04junk")
         assert str(tmp_path) in refused(main, tmp_path, *more)
+
+
+def test_a_disk_that_fills_up_in_the_end_is_named_and_the_old_numbers_stay(tmp_path, monkeypatch):
+    kept = tmp_path / "kept.json"
+    evaluate.write(kept, {"rows": [1]})
+    with pytest.raises(ConfigError, match="/dev/full: No space left"):
+        evaluate.write(Path("/dev/full"), {"rows": [2]})
+
+    def full(self, text):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(ConfigError, match=r"kept\.json: No space left"):
+        evaluate.write(kept, {"rows": [2]})
+    assert json.loads(kept.read_text()) == {"rows": [1]}
 
 
 class TestPlay:

@@ -98,6 +98,15 @@ def test_an_answer_to_another_question_does_not_count(tmp_path, called, other):
     assert compare.main([*argv, *other]) == 1 and called == ["train"]
 
 
+def test_a_run_that_trains_on_is_not_done_by_its_old_evaluation(tmp_path, called):
+    """Neither in the table nor at the next call, even if all that is left to do fails."""
+    finished_run(tmp_path / "kslc-seed0")
+    argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0"]
+    assert compare.main([*argv, "--steps", "2500001"]) == 1
+    assert compare.finished(tmp_path) == []
+    assert compare.main(argv) == 1 and called == ["train", "train"]
+
+
 def test_the_children_are_as_quiet_as_each_command_alone(tmp_path, called, monkeypatch):
     """They inherit what XLA is told to say, which JAX sets itself where nobody has."""
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
