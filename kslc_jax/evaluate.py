@@ -20,7 +20,6 @@ import tyro
 
 from kslc_jax import runtime
 from kslc_jax.config import ConfigError, Fidelity, require_seed
-from kslc_jax.logs import write_whole
 
 HEADLINE = (
     ("survival", "survived", "{:.0%}"),
@@ -99,6 +98,8 @@ def require_writable(path: Path | None) -> None:
 
 def write(path: Path, content: dict[str, Any]) -> None:
     """Keeps numbers as JSON; ConfigError where that fails, and then the old file is still whole."""
+    from kslc_jax.logs import write_whole  # and with it TensorBoard, 0.1 s
+
     special = path.exists() and not path.is_file()  # /dev/stdout
     try:
         (Path.write_text if special else write_whole)(path, json.dumps(content, indent=1))
