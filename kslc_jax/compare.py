@@ -11,12 +11,15 @@ Examples:
   python -m kslc_jax.compare --variants kslc no-arms --seeds 0 --keep docs/results/compare
 """
 
+import dataclasses
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 import tyro
 from rich import box
@@ -24,10 +27,10 @@ from rich.console import Console
 from rich.table import Table
 
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, plots, runtime
-from kslc_jax.config import ConfigError, Fidelity
+from kslc_jax import evaluate, files, plots, runtime
+from kslc_jax.config import Config, ConfigError, Fidelity
 from kslc_jax.learning import LEARNING
-from kslc_jax.logs import METRICS, write_whole
+from kslc_jax.logs import METRICS
 from kslc_jax.plots import EVALUATION
 
 WIDTH = 200
@@ -89,6 +92,7 @@ class Job:
     variant: str
     seed: int
     folder: Path
+    config: Config  # of the training, but for how long it is and what it keeps
     train: tuple[str, ...]  # arguments of kslc_jax.train
     evaluate: tuple[str, ...]  # arguments of kslc_jax.evaluate
 
@@ -108,6 +112,8 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     folder = args.out / f"{variant}-seed{seed}"
     preset = args.baseline if variant == "baseline" else args.preset
     without = ("--without", ablation) if ablation else ()
+    parts = (ablation,) if ablation else ()
+    config = dataclasses.replace(config_lib.preset(preset, parts), seed=seed)
     what = ("--preset", preset, *without, "--seed", str(seed))
     length = ("--steps", str(args.steps), "--run.snapshots", str(args.snapshots))
     # Told on resume too: train refuses to go on with another preset than it began with.
@@ -116,7 +122,16 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     speeds = ("--speeds", *map(str, args.speeds))
     trials = ("--seeds", str(args.trials), "--fidelity", args.fidelity)
     kept = ("--json", str(folder / EVALUATION))
-    return Job(variant, seed, folder, (*what, *run), (str(folder), *speeds, *trials, *kept))
+    evaluation = (str(folder), *speeds, *trials, *kept)
+    return Job(variant, seed, folder, config, (*what, *run), evaluation)
+
+
+def require_ours(job: Job) -> None:
+    """ConfigError or RunError where the folder holds a training of something else."""
+    from kslc_jax import run_folder
+
+    if (job.folder / run_folder.CONFIG).exists():
+        run_folder.difference(run_folder.read_config(job.folder), job.config)
 
 
 def run(job: Job, steps: int) -> bool:
@@ -152,14 +167,22 @@ def is_done(job: Job, args: Args) -> bool:
 
 
 def call(module: str, arguments: tuple[str, ...]) -> bool:
-    """Whether a command of this package succeeded. At Ctrl-C, which it hears too, it is given the
-    time to save."""
+    """Whether a command of this package succeeded. At Ctrl-C, which it hears too, and at SIGTERM,
+    which is passed on, it is given the time to save; then KeyboardInterrupt."""
     process = subprocess.Popen([sys.executable, "-m", f"kslc_jax.{module}", *arguments])
+
+    def terminate(number: int, _: FrameType | None) -> None:
+        process.terminate()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, terminate)
     try:
         return process.wait() == 0
     except KeyboardInterrupt:
         process.wait()
         raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def finished(out: Path) -> list[Path]:
@@ -171,16 +194,16 @@ def keep(run: Path, folder: Path) -> None:
     """Copies a finished run's evaluation and what `plots` reads of its learning curves and of its
     metrics: every tenth record, and those at which the range of commands grew."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / EVALUATION, (run / EVALUATION).read_text())
+    files.write_whole(folder / EVALUATION, (run / EVALUATION).read_text())
     learnt = json.loads((run / LEARNING).read_text())
     for point in learnt["points"]:
         point["rows"] = [{n: _short(row[n]) for n in plots.LEARNT} for row in point["rows"]]
-    write_whole(folder / LEARNING, json.dumps(learnt))
+    files.write_whole(folder / LEARNING, json.dumps(learnt))
     records = plots.read_metrics(run)
     count = len(records["env_steps"])
     kept = sorted({*range(0, count, 10), *plots.growth(records), count - 1})
     rows = ({name: _short(records[name][i]) for name in plots.COLUMNS} for i in kept)
-    write_whole(folder / METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
+    files.write_whole(folder / METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
 
 
 def _short(x: float) -> float:
@@ -230,10 +253,18 @@ def report(args: Args) -> None:
 
 def run_all(args: Args) -> list[str]:
     """Does what is not done before; the names of what failed."""
+    from kslc_jax.run_folder import RunError
+
     failed = []
     todo = list(jobs(args))
     for i, job in enumerate(todo):
         name = job.folder.name
+        try:
+            require_ours(job)
+        except (ConfigError, RunError) as error:
+            print(f"error: {job.folder}: {error}; or name another --out", file=sys.stderr)
+            failed.append(name)
+            continue
         if is_done(job, args):
             print(f"[{i + 1}/{len(todo)}] {name}: done before")
             continue
@@ -249,7 +280,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, description=__doc__)
         if args.keep:
-            evaluate.require_writable(args.keep / EVALUATION)
+            files.require_writable(args.keep / EVALUATION)
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -7,18 +7,15 @@ self-collision, joint friction. Prints a table with 95 % confidence intervals; -
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
 
-import json
 import math
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import tyro
 
-from kslc_jax import runtime
+from kslc_jax import files, runtime
 from kslc_jax.config import ConfigError, Fidelity, require_seed
 
 HEADLINE = (
@@ -82,29 +79,6 @@ def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
         raise ConfigError("seeds must be positive")
     if not (SHORTEST <= seconds <= LONGEST and seconds == round(seconds)):
         raise ConfigError(f"seconds must be a whole number from {SHORTEST:g} to {LONGEST:g}")
-
-
-def require_writable(path: Path | None) -> None:
-    """ConfigError where a result could not be written in the end; makes its folder."""
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise ConfigError(f"cannot write {path}")
-
-
-def write(path: Path, content: dict[str, Any]) -> None:
-    """Keeps numbers as JSON; ConfigError where that fails, and then the old file is still whole."""
-    from kslc_jax.logs import write_whole  # and with it TensorBoard, 0.1 s
-
-    special = path.exists() and not path.is_file()  # /dev/stdout
-    try:
-        (Path.write_text if special else write_whole)(path, json.dumps(content, indent=1))
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
 
 
 def measure(
@@ -202,7 +176,7 @@ def _report(args: Args) -> None:
 
     from kslc_jax.checkpoint import load_policy
 
-    require_writable(args.json)
+    files.require_writable(args.json)
     policy = load_policy(args.policy)
     screen = console()
     with Progress(console=screen, transient=True) as bar:
@@ -213,7 +187,7 @@ def _report(args: Args) -> None:
     if args.json is not None:
         what = {"policy": str(args.policy), "step": policy.step}
         how = {n: getattr(args, n) for n in ("fidelity", "seeds", "seconds", "noise", "seed")}
-        write(args.json, {**what, **how, "rows": rows})
+        files.write_json(args.json, {**what, **how, "rows": rows})
 
 
 if __name__ == "__main__":

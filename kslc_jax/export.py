@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import tyro
 
-from kslc_jax import __version__, evaluate, runtime
+from kslc_jax import __version__, files, runtime
 from kslc_jax.config import NUM_JOINTS, Config, ConfigError
 
 if TYPE_CHECKING:
@@ -302,7 +302,7 @@ def main(argv: list[str] | None = None) -> int:
         if args.chosen == "orbax":
             args.out.parent.mkdir(parents=True, exist_ok=True)
         else:
-            evaluate.require_writable(args.out)
+            files.require_writable(args.out)
         policy = load_policy(args.policy)
         if args.chosen == "orbax":
             save_policy(policy, args.out)

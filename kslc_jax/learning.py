@@ -16,7 +16,7 @@ from typing import Any
 
 import tyro
 
-from kslc_jax import evaluate, runtime
+from kslc_jax import evaluate, files, runtime
 from kslc_jax.config import ConfigError
 
 LEARNING = "learning.json"
@@ -97,7 +97,7 @@ def main(argv: list[str] | None = None) -> int:
             for run in args.runs:
                 task = bar.add_task(str(run), total=1.0)
                 found = curve(run, args, lambda done, task=task: bar.update(task, completed=done))
-                evaluate.write(run / LEARNING, found)
+                files.write_json(run / LEARNING, found)
                 bar.console.print(f"wrote {run / LEARNING}")
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)

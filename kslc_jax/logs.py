@@ -17,23 +17,13 @@ from tensorboardX.proto import event_pb2
 from tensorboardX.summary import Summary
 
 from kslc_jax.config import Config
+from kslc_jax.files import write_whole
 
 METRICS = "metrics.jsonl"
 """The file's name in a run folder."""
 
 PLAIN_SECONDS = 10.0
 """Seconds between progress lines where the output is no terminal."""
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Writes a file at once: whatever happens, `path` holds all of the old or all of the new."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        part.write_text(text)
-        os.replace(part, path)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
 
 
 def rows_written(run_dir: Path) -> int:

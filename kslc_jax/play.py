@@ -18,7 +18,7 @@ from pathlib import Path
 
 import tyro
 
-from kslc_jax import evaluate, runtime, sim2sim
+from kslc_jax import files, runtime, sim2sim
 from kslc_jax.config import ConfigError, Fidelity, require_seed
 
 FPS = 50
@@ -163,7 +163,7 @@ def draw(args: Args, policy) -> None:
     from kslc_jax import render
 
     for path in (args.gait_strip, args.video):
-        evaluate.require_writable(path)
+        files.require_writable(path)
     if args.video is not None:
         film_writer()
     trace, start, dt = record(args, policy)
@@ -214,6 +214,8 @@ def main(argv: list[str] | None = None) -> int:
         args = tyro.cli(Args, args=argv, description=__doc__)
         if not args.live:
             from kslc_jax import render  # noqa: F401 (before anything that imports mujoco)
+
+            sim2sim.simulator(args.engine)  # what is not installed is told at once
     except (ConfigError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

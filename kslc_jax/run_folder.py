@@ -17,10 +17,15 @@ import jax
 from kslc_jax import checkpoint
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.logs import rows_written, write_whole
+from kslc_jax.files import write_whole
+from kslc_jax.logs import rows_written
 from kslc_jax.runtime import first_line
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+CONFIG = "config.json"
+"""The file's name in a run folder."""
 
 
 class RunError(RuntimeError):
@@ -93,16 +98,16 @@ def open_folder(run_dir: Path, config: Config, resume: bool, origin: dict[str, s
     with writing(run_dir):
         if not resume:
             write_whole(run_dir / "versions.json", json.dumps(versions() | origin, indent=1))
-        write_whole(run_dir / "config.json", json.dumps(config_lib.to_dict(config), indent=1))
+        write_whole(run_dir / CONFIG, json.dumps(config_lib.to_dict(config), indent=1))
 
 
 def read_config(run_dir: Path) -> Config:
     """The config stored in a run folder; RunError if there is none, ConfigError if damaged."""
-    path = run_dir / "config.json"
+    path = run_dir / CONFIG
     try:
         return config_lib.from_dict(json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise RunError(f"{run_dir} holds no training to resume (no config.json)") from error
+        raise RunError(f"{run_dir} holds no training to resume (no {CONFIG})") from error
     except OSError as error:
         raise RunError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # no JSON, or no text

@@ -32,12 +32,17 @@ from kslc_jax.run_folder import locked, open_folder, writing
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
 
+ONE_WISH = 1.0
+"""Seconds within which signals count as one: a scheduler that signals every process of a job tells
+a training twice, itself and by way of what started it."""
+
 
 class _Stop:
     """Turns the first SIGINT or SIGTERM into a request that the loop reads between steps."""
 
     def __init__(self) -> None:
         self.requested: str | None = None
+        self._since = 0.0
 
     def __enter__(self) -> "_Stop":
         self._old = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
@@ -48,9 +53,10 @@ class _Stop:
             signal.signal(number, handler)
 
     def _handle(self, number: int, _: FrameType | None) -> None:
-        if self.requested:  # a second one means now
+        if not self.requested:
+            self.requested, self._since = signal.Signals(number).name, time.monotonic()
+        elif time.monotonic() - self._since > ONE_WISH:  # a second one means now
             raise KeyboardInterrupt
-        self.requested = signal.Signals(number).name
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from typing import Any, Literal
 
 import tyro
 
-from kslc_jax import evaluate, runtime
+from kslc_jax import evaluate, files, runtime
 from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig, require_seed
 
 Engine = Literal["mujoco", "drake"]
@@ -198,7 +198,7 @@ def _report(args: Args) -> None:
 
     from kslc_jax.checkpoint import load_policy
 
-    evaluate.require_writable(args.json)
+    files.require_writable(args.json)
     policy = load_policy(args.policy)
     screen = evaluate.console()
     # Reports come once a simulated second: the estimate of the time left needs a long memory.
@@ -219,7 +219,7 @@ def _report(args: Args) -> None:
         what = {"policy": str(args.policy), "step": policy.step}
         names = ("engine", "seeds", "seconds", "noise", "latency", "seed")
         how = {name: getattr(args, name) for name in names}
-        evaluate.write(args.json, {**what, **how, "conditions": results})
+        files.write_json(args.json, {**what, **how, "conditions": results})
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ import errno
 import io
 import json
 import string
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from kslc_jax import (
     doctor,
     evaluate,
     export,
+    files,
     learning,
     play,
     plots,
@@ -278,16 +280,16 @@ class TestPolicyCommands:
 
 def test_a_disk_that_fills_up_in_the_end_is_named_and_the_old_numbers_stay(tmp_path, monkeypatch):
     kept = tmp_path / "kept.json"
-    evaluate.write(kept, {"rows": [1]})
+    files.write_json(kept, {"rows": [1]})
     with pytest.raises(ConfigError, match="/dev/full: No space left"):
-        evaluate.write(Path("/dev/full"), {"rows": [2]})
+        files.write_json(Path("/dev/full"), {"rows": [2]})
 
     def full(self, text):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(ConfigError, match=r"kept\.json: No space left"):
-        evaluate.write(kept, {"rows": [2]})
+        files.write_json(kept, {"rows": [2]})
     assert json.loads(kept.read_text()) == {"rows": [1]}
 
 
@@ -296,6 +298,11 @@ class TestPlay:
     @given(word=words, option=st.sampled_from(["--gait-strip", "--video"]))
     def test_suffix(self, policy, run_dir, word, option):
         assert word in refused(play.main, policy, option, run_dir / f"x.{word}")
+
+    def test_drake_is_not_installed(self, monkeypatch, tmp_path):
+        """Told before the policy is looked for."""
+        monkeypatch.setitem(sys.modules, "kslc_jax.drake", None)
+        assert "kslc_jax[drake]" in refused(play.main, tmp_path, *PICTURE, "--engine", "drake")
 
     def test_drake_has_no_training_engine(self, policy):
         said = refused(play.main, policy, *PICTURE, "--engine", "drake", "--fidelity", "train")

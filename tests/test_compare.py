@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from kslc_jax import compare, plots
+from kslc_jax import compare, config, plots
 
 
 def test_every_variant_and_seed_is_a_job(tmp_path):
@@ -98,6 +98,22 @@ def test_an_answer_to_another_question_does_not_count(tmp_path, called, other):
     assert compare.main([*argv, *other]) == 1 and called == ["train"]
 
 
+@pytest.mark.parametrize("steps", ["2500000", "2500001"], ids=["finished", "to go on with"])
+def test_a_run_of_another_config_is_named_and_left_alone(tmp_path, called, capsys, steps):
+    """It would be taken for the one that is asked for, or its evaluation be lost."""
+    folder = tmp_path / "kslc-seed0"
+    finished_run(folder)
+    other = config.preset("laptop", ("arms",))
+    (folder / "config.json").write_text(json.dumps(config.to_dict(other)))
+    argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0", "--steps", steps]
+    assert compare.main(argv) == 1 and not called
+    err = capsys.readouterr().err.splitlines()
+    assert err[0].startswith(f"error: {folder}: ") and err[0].endswith("or name another --out")
+    assert (folder / compare.EVALUATION).exists()
+    (folder / "config.json").write_text(json.dumps(config.to_dict(config.preset("laptop"))))
+    assert compare.main(argv) == (steps != "2500000")
+
+
 def test_a_run_that_trains_on_is_not_done_by_its_old_evaluation(tmp_path, called):
     """Neither in the table nor at the next call, even if all that is left to do fails."""
     finished_run(tmp_path / "kslc-seed0")
@@ -165,15 +181,20 @@ def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
     assert called == [("train", "--preset")]
 
 
-def test_an_interrupt_leaves_time_to_save(tmp_path):
-    """The child hears of it as well, and takes longer than the 0.25 s that subprocess.run gives."""
+@pytest.mark.parametrize(
+    ("number", "tell"),
+    [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill)],
+    ids=["to all", "to the parent"],
+)
+def test_a_signal_leaves_time_to_save(tmp_path, number, tell):
+    """The child takes longer than the 0.25 s that subprocess.run would give it."""
     child = """
 import signal, sys, time
 def save(*_):
     time.sleep(1.0)
     open(sys.argv[1], "w").close()
     sys.exit(0)
-signal.signal(signal.SIGINT, save)
+signal.signal(int(sys.argv[2]), save)
 open(sys.argv[1] + ".ready", "w").close()
 time.sleep(60)
 """
@@ -182,7 +203,8 @@ import signal, subprocess, sys
 from kslc_jax import compare
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
 start = subprocess.Popen
-subprocess.Popen = lambda _: start([sys.executable, "-c", {child!r}, {str(tmp_path / "saved")!r}])
+child = [sys.executable, "-c", {child!r}, {str(tmp_path / "saved")!r}, "{number:d}"]
+subprocess.Popen = lambda _: start(child)
 compare.call("train", ())
 """
     process = subprocess.Popen(
@@ -191,7 +213,7 @@ compare.call("train", ())
     while not (tmp_path / "saved.ready").exists():
         assert process.poll() is None
         time.sleep(0.05)
-    os.killpg(process.pid, signal.SIGINT)
+    tell(process.pid, number)
     assert process.wait(timeout=30) != 0
     assert (tmp_path / "saved").exists()
 
