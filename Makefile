@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # setuptools warns of editable installs whose package lies beside pyproject.toml; ours should.
 PIP := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: help train test test-all test-notebooks lint bench bench-full clean
+.PHONY: help train test test-all test-notebooks lint figures results bench bench-full clean
 
 help: ## What there is
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 16
@@ -37,6 +37,14 @@ lint: $(STAMP) ## ruff and ty
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ty check
+
+# The commands stand in docs/results.md, each beside what it makes.
+figures: $(STAMP) ## The figures of docs/results.md again, from the data beside them: a minute
+	@grep '^python -m kslc_jax.plots' docs/results.md | PATH="$(BIN):$$PATH" sh -ex
+
+results: $(STAMP) ## Those data too, from the shipped policy, and its gait strips: half an hour
+	@$(PIP) -e '.[drake]'
+	@grep -E '^python -m kslc_jax.(evaluate|sim2sim|play|plots)' docs/results.md | PATH="$(BIN):$$PATH" sh -ex
 
 bench: $(STAMP) ## Throughput of a whole training step
 	@$(BIN)/python -m benchmarks.throughput --repeats 3 $(ARGS)
