@@ -186,8 +186,13 @@ def call(module: str, arguments: tuple[str, ...]) -> bool:
 
 
 def finished(out: Path) -> list[Path]:
-    """Run folders that have been evaluated."""
-    return sorted(path.parent for path in out.glob(f"*/{EVALUATION}"))
+    """Run folders that have been evaluated, in the order of `VARIANTS`."""
+
+    def place(run: Path) -> tuple[int, str]:
+        variant, _, _ = run.name.rpartition("-seed")
+        return (VARIANTS.index(variant) if variant in VARIANTS else len(VARIANTS)), run.name
+
+    return sorted((path.parent for path in out.glob(f"*/{EVALUATION}")), key=place)
 
 
 def keep(run: Path, folder: Path) -> None:

@@ -141,6 +141,13 @@ def test_the_table_of_what_is_finished(tmp_path, capsys):
     assert second == ["kslc-seed1", "2.5 M", "1.5", "1.4 M, 2 min", "falls"]
 
 
+def test_runs_stand_in_the_order_of_the_variants(tmp_path):
+    names = ["kslc-seed0", "kslc-seed1", "baseline-seed0", "no-arms-seed0", "another"]
+    for name in reversed(names):
+        finished_run(tmp_path / name)
+    assert [run.name for run in compare.finished(tmp_path)] == names
+
+
 def test_what_is_kept_draws_the_same_figures(tmp_path):
     run, kept = tmp_path / "runs" / "kslc-seed0", tmp_path / "kept"
     finished_run(run)

@@ -1,0 +1,73 @@
+"""The tables of docs/results.md say what the data beside them say."""
+
+import itertools
+import json
+from pathlib import Path
+
+from kslc_jax import compare
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+FORMS = {
+    "survived": ("survival", "{:.0%}"),
+    "mean vx [m/s]": ("forward_mean", "{:.2f}"),
+    "lateral std [m/s]": ("lateral_std", "{:.2f}"),
+    "yaw-rate std [rad/s]": ("yaw_rate_std", "{:.2f}"),
+    "strides/s": ("stride_frequency", "{:.2f}"),
+    "flight": ("flight_share", "{:.0%}"),
+    "clearance [m]": ("clearance", "{:.3f}"),
+    "arm-leg correlation": ("shoulder_hip_correlation", "{:.2f}"),
+    "within speed limits": ("within_speed_limits", "{:.1%}"),
+    "cost of transport": ("cost_of_transport", "{:.2f}"),
+}
+"""Columns of the document: metric and how it is written; command 0 has no cost of transport."""
+
+
+def table(section: str) -> list[list[str]]:
+    """Cells of a section's first table, its header first."""
+    text = (DOCS / "results.md").read_text().split(f"\n## {section}\n")[1]
+    lines = itertools.dropwhile(lambda line: not line.startswith("|"), text.splitlines())
+    head, _, *rows = itertools.takewhile(lambda line: line.startswith("|"), lines)
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in (head, *rows)]
+
+
+def conditions(name: str) -> dict:
+    return json.loads((DOCS / "results" / f"{name}.json").read_text())["conditions"]
+
+
+def test_high_fidelity():
+    head, *rows = table("Full C MuJoCo, high fidelity")
+    stored = conditions("sim2sim")["nominal"]
+    assert set(head) == {"command [m/s]", *FORMS} and len(rows) == len(stored)
+    for cells, numbers in zip(rows, stored, strict=True):
+        assert cells[0] == f"{numbers['command']:.1f}"
+        for label, cell in zip(head[1:], cells[1:], strict=True):
+            name, form = FORMS[label]
+            assert cell == (form.format(numbers[name]) if name in numbers else "-"), (label, cells)
+
+
+def test_perturbed():
+    head, *rows = table("Perturbed")
+    stored = conditions("perturbed")
+    assert [cells[0] for cells in rows] == list(stored)
+    for cells in rows:
+        for command, cell, numbers in zip(head[1:], cells[1:], stored[cells[0]], strict=True):
+            assert float(command) == numbers["command"]
+            assert cell == f"{numbers['survival']:.0%} {numbers['forward_mean']:.2f}"
+
+
+def test_drake():
+    head, *rows = table("A second engine: Drake")
+    (stored,) = conditions("drake").values()
+    stored = [numbers for numbers in stored if numbers["command"] > 0]
+    assert [float(command) for command in head[1:]] == [n["command"] for n in stored]
+    for label, *cells in rows:
+        name, form = FORMS[label]
+        assert cells == [form.format(numbers[name]) for numbers in stored]
+
+
+def test_compare():
+    shown = compare.table(compare.finished(DOCS / "results" / "compare"))
+    head, *rows = table("KSLC, its baseline and its ablations")
+    assert head == [column.header for column in shown.columns]
+    assert rows == [list(cells) for cells in zip(*(c.cells for c in shown.columns), strict=True)]
