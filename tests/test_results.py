@@ -4,7 +4,8 @@ import itertools
 import json
 from pathlib import Path
 
-from kslc_jax import compare
+from kslc_jax import compare, plots
+from kslc_jax.checkpoint import POLICIES
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -71,3 +72,17 @@ def test_compare():
     head, *rows = table("KSLC, its baseline and its ablations")
     assert head == [column.header for column in shown.columns]
     assert rows == [list(cells) for cells in zip(*(c.cells for c in shown.columns), strict=True)]
+
+
+def test_what_to_expect():
+    """README's table, the policy's milestones and the stored training are one."""
+    records = plots.read_metrics(DOCS / "training" / "laptop-seed0.jsonl")
+    reached = plots.milestones(records)
+    policy = json.loads((POLICIES / "xbot_l_run" / "milestones.json").read_text())
+    assert {f"{v:g}": steps for v, steps, _ in reached} == policy
+    lines = (DOCS.parent / "README.md").read_text().splitlines()
+    said = [line.removeprefix("| commands up to ") for line in lines if "| commands up to" in line]
+    assert len(said) == len(reached)
+    for line, (v, steps, seconds) in zip(said, reached, strict=True):
+        assert line.startswith(f"{v:.1f} m/s"), line
+        assert line.endswith(f"| {steps / 1e6:.1f} M | {seconds / 60:.0f} min |"), line
