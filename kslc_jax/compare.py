@@ -196,10 +196,14 @@ def finished(out: Path) -> list[Path]:
 
 
 def keep(run: Path, folder: Path) -> None:
-    """Copies a finished run's evaluation and what `plots` reads of its learning curves and of its
-    metrics: every tenth record, and those at which the range of commands grew."""
+    """Copies a finished run's config, versions and evaluation, and what `plots` reads of its
+    learning curves and of its metrics: every tenth record, and those at which the range of commands
+    grew."""
+    from kslc_jax.run_folder import CONFIG, VERSIONS
+
     folder.mkdir(parents=True, exist_ok=True)
-    files.write_whole(folder / EVALUATION, (run / EVALUATION).read_text())
+    for name in (CONFIG, VERSIONS, EVALUATION):
+        files.write_whole(folder / name, (run / name).read_text())
     learnt = json.loads((run / LEARNING).read_text())
     for point in learnt["points"]:
         point["rows"] = [{n: _short(row[n]) for n in plots.LEARNT} for row in point["rows"]]

@@ -24,8 +24,8 @@ from kslc_jax.runtime import first_line
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-CONFIG = "config.json"
-"""The file's name in a run folder."""
+CONFIG, VERSIONS = "config.json", "versions.json"
+"""The files' names in a run folder."""
 
 
 class RunError(RuntimeError):
@@ -97,7 +97,7 @@ def open_folder(run_dir: Path, config: Config, resume: bool, origin: dict[str, s
         )
     with writing(run_dir):
         if not resume:
-            write_whole(run_dir / "versions.json", json.dumps(versions() | origin, indent=1))
+            write_whole(run_dir / VERSIONS, json.dumps(versions() | origin, indent=1))
         write_whole(run_dir / CONFIG, json.dumps(config_lib.to_dict(config), indent=1))
 
 

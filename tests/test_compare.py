@@ -1,5 +1,6 @@
 """The matrix of trainings: its jobs, that a stopped one goes on, its table, what is kept of it."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -45,6 +46,10 @@ def test_an_interrupted_training_is_resumed(tmp_path):
 def finished_run(folder, survival=1.0):
     """A run folder as a job leaves it, of 25 train steps, the range growing at the 14th."""
     folder.mkdir(parents=True)
+    seed = int(folder.name[-1])
+    laptop = dataclasses.replace(config.preset("laptop"), seed=seed)
+    (folder / "config.json").write_text(json.dumps(config.to_dict(laptop)))
+    (folder / "versions.json").write_text(json.dumps({"git": "0123abc"}))
     row = {"command": 1.0, "forward_mean": 0.97, "survival": survival}
     (folder / compare.EVALUATION).write_text(
         json.dumps({"fidelity": "high", "seeds": 8, "rows": [row]})
@@ -142,7 +147,7 @@ def test_the_table_of_what_is_finished(tmp_path, capsys):
 
 
 def test_runs_stand_in_the_order_of_the_variants(tmp_path):
-    names = ["kslc-seed0", "kslc-seed1", "baseline-seed0", "no-arms-seed0", "another"]
+    names = ["kslc-seed0", "kslc-seed1", "baseline-seed0", "no-arms-seed0", "another1"]
     for name in reversed(names):
         finished_run(tmp_path / name)
     assert [run.name for run in compare.finished(tmp_path)] == names
@@ -160,9 +165,8 @@ def test_what_is_kept_draws_the_same_figures(tmp_path):
     assert list(short["episode_steps"]) == [0.33333] * 5
     (curve,) = plots.read_learning([kept / run.name])["kslc"]
     assert curve.reached == [[0.66667]] and curve.env_steps == [2500000]
-    assert (kept / run.name / compare.EVALUATION).read_text() == (
-        run / compare.EVALUATION
-    ).read_text()
+    for name in ("config.json", "versions.json", compare.EVALUATION):
+        assert (kept / run.name / name).read_text() == (run / name).read_text()
 
 
 def test_keeping_never_writes_into_the_runs(tmp_path, capsys):
