@@ -19,11 +19,12 @@ class Controller:
     def __init__(self, path, vx, vy=0.0, heading=0.0):
         self.network = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         text = self.network.get_modelmeta().custom_metadata_map
-        if text.get("metadata_version") != "1":
-            raise SystemExit(f"error: {path} has no metadata of version 1, see docs/export.md")
+        if text.get("metadata_version") != "2":
+            raise SystemExit(f"error: {path} has no metadata of version 2, see docs/export.md")
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
-        self.velocity, self.heading, self.phase = np.array([vx, vy]), heading, 0.0
+        walks = np.hypot(vx, vy) > m.command.dead_zone
+        self.velocity, self.heading, self.phase = walks * np.array([vx, vy]), heading, 0.0
         self.free = np.array([name not in m.held_joints for name in m.joint_names])
         self.action = np.zeros(len(m.joint_names))
         self.history = np.zeros((m.history_length, sum(c.width for c in m.frame)), np.float32)

@@ -47,9 +47,8 @@ def sample(
     vx = jnp.where(stand, 0.0, vx)
     vy = jnp.where(forward, 0.0, vy)
     heading = jnp.where(forward, yaw, heading)
-    alive = jnp.hypot(vx, vy) > config.dead_zone
-    velocity = jnp.stack([vx, vy, jnp.zeros(())]) * alive
-    return steer(config, Command(velocity, heading, alive), yaw)
+    velocity = jnp.stack([vx, vy, jnp.zeros(())])
+    return steer(config, Command(velocity, heading, jnp.zeros((), bool)), yaw)
 
 
 def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:
@@ -60,8 +59,10 @@ def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:
 
 
 def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) -> Command:
-    """The command with `velocity` [3]; decides whether that means standing still."""
-    walks = jnp.any(velocity[:2] != 0.0)
+    """The command with `velocity` [3], vx and vy zero within the dead zone; decides whether that
+    means standing still."""
+    walks = jnp.hypot(velocity[0], velocity[1]) > config.dead_zone
+    velocity = velocity * jnp.stack([walks, walks, jnp.ones((), bool)])
     if not config.stand_still:
         return command.replace(velocity=velocity, moving=jnp.ones((), bool))
     moving = walks | (jnp.abs(velocity[2]) > TURNING)

@@ -78,8 +78,8 @@ def check_devices() -> str:
     """JAX uses the accelerator if there is one."""
     import jax
 
-    if jax.default_backend() == "cpu" and Path("/dev/nvidia0").exists():
-        raise RuntimeError("there is an NVIDIA GPU, but JAX computes on the CPU")
+    if idle := runtime.idle_gpu():
+        raise RuntimeError(idle)
     return ", ".join(f"{d.platform}: {d.device_kind}" for d in jax.devices())
 
 

@@ -33,7 +33,7 @@ Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
 """Histories [B, K, 59] to actions [B, 16]."""
 
-METADATA_VERSION = 1
+METADATA_VERSION = 2
 """Of the names and meanings in `metadata`; grows when one of them changes."""
 
 INSTALL = "pip install 'kslc_jax[export]'"
@@ -100,6 +100,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
             "base_cycle_time": config.gait.cycle_time,
         },
         "command": {
+            "dead_zone": config.command.dead_zone,
             "heading_gain": config.command.heading_gain,
             "max_yaw_rate": config.command.max_yaw_rate,
             "stand_still": config.command.stand_still,

@@ -20,6 +20,10 @@ JAX_FIX = "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
 """A JAX that does not, as in pyproject.toml."""
 
 
+NVIDIA = Path("/dev/nvidia0")
+"""There where the driver of an NVIDIA GPU is."""
+
+
 def cache_dir() -> Path:
     """Folder of the persistent compilation cache."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -59,6 +63,15 @@ def auto_preset() -> str:
     import jax
 
     return "laptop" if jax.default_backend() == "cpu" else "paper"
+
+
+def idle_gpu() -> str:
+    """What to say where an NVIDIA GPU is there that JAX does not use; empty where there is none."""
+    import jax
+
+    if jax.default_backend() != "cpu" or not NVIDIA.exists():
+        return ""
+    return "there is an NVIDIA GPU, but JAX computes on the CPU: pip install 'kslc_jax[cuda]'"
 
 
 class JaxError(RuntimeError):

@@ -2,7 +2,8 @@
 
 Picks a preset, lets every field of it be overridden, and trains into a run folder that holds the
 config, versions, metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and leaves;
---resume goes on bit for bit.
+--resume goes on bit for bit. The defaults below are those of the laptop preset, or of the --preset
+named before --help.
 
 Examples:
   python -m kslc_jax.train                          # paper preset on a GPU, laptop preset without
@@ -175,6 +176,8 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     title, run_dir = headline(args)
     progress = Progress(args.config, None if devices.is_first() else Console(quiet=True))
     progress.say(f"{title}: {runner.describe(args.config, run_dir, mesh)}")
+    if idle := runtime.idle_gpu():
+        progress.warn(idle)
     how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
     try:
         runner.train(args.config, run_dir, args.resume, progress, **how)

@@ -154,6 +154,9 @@ def test_a_share_of_the_commands_is_slow():
         ([0.0, 0.0, -0.11], True, [0.0, 0.0, -0.11]),
         ([0.0, 0.0, 0.09], False, [0.0, 0.0, 0.0]),  # not worth a step
         ([0.0, 0.0, 0.0], False, [0.0, 0.0, 0.0]),
+        ([0.15, -0.13, 0.0], False, [0.0, 0.0, 0.0]),  # within the dead zone
+        ([0.15, -0.13, 0.2], True, [0.0, 0.0, 0.2]),
+        ([0.15, -0.14, 0.0], True, [0.15, -0.14, 0.0]),
     ],
 )
 @pytest.mark.parametrize("jit", [False, True])
@@ -165,7 +168,7 @@ def test_when_a_command_means_standing_still(velocity, moving, left, jit):
     np.testing.assert_allclose(command.velocity, left)
     always = commands.with_velocity(PAPER, make_command(moving=False), jnp.asarray(velocity))
     assert bool(always.moving)
-    np.testing.assert_allclose(always.velocity, velocity)
+    np.testing.assert_allclose(always.velocity, [*left[:2], velocity[2]])
 
 
 def test_a_standing_robot_that_drifts_turns_back():

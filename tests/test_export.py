@@ -133,7 +133,7 @@ def test_the_graph_is_flatten_gemm_and_elu(onnx_file):
 def test_metadata(symmetric, xbot):
     """By literal numbers where the paper or Humanoid-Gym gives them."""
     data = export.metadata(symmetric)
-    assert data["metadata_version"] == 1 and data["train_step"] == 7
+    assert data["metadata_version"] == 2 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
     assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
     assert data["effort_limit"][3] == 212.5
@@ -149,7 +149,8 @@ def test_metadata(symmetric, xbot):
         "cycle_follows_speed": True,
         "base_cycle_time": 0.64,
     }
-    assert data["command"]["stand_still"] and data["held_joints"] == []
+    assert data["command"]["stand_still"] and data["command"]["dead_zone"] == 0.2
+    assert data["held_joints"] == []
 
 
 def test_the_file_holds_the_metadata_as_json(policy, onnx_file):
