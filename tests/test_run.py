@@ -485,3 +485,11 @@ def test_snapshots_come_in_the_order_of_their_steps(tmp_path):
     for step in (100, 1000, 200):
         (tmp_path / "snapshots" / str(step)).mkdir(parents=True)
     assert [path.name for path in learning.snapshots(tmp_path)] == ["100", "200", "1000"]
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_gpu_that_jax_does_not_use_is_told(there, tmp_path, monkeypatch):
+    if there:
+        (tmp_path / "nvidia0").touch()
+    monkeypatch.setattr(runtime, "NVIDIA", tmp_path / "nvidia0")
+    assert ("kslc_jax[cuda]" in runtime.idle_gpu()) == there
