@@ -23,7 +23,17 @@ import pytest
 from rich.console import Console
 
 import kslc_jax
-from kslc_jax import checkpoint, disk, keeper, learning, run_folder, runner, train, train_step
+from kslc_jax import (
+    checkpoint,
+    disk,
+    keeper,
+    learning,
+    run_folder,
+    runner,
+    runtime,
+    train,
+    train_step,
+)
 from kslc_jax.config import ConfigError, preset
 from kslc_jax.logs import MetricsFile, Progress
 
@@ -437,8 +447,6 @@ def test_metrics_behind_the_checkpoint_are_dropped(tmp_path):
 
 
 def test_versions_known_to_hang_are_refused():
-    from kslc_jax import runtime
-
     for bad in ("0.10.0", "0.10.2", "0.11.0"):
         with pytest.raises(RuntimeError, match="pip install"):
             runtime.check_jax(bad, "cpu")
