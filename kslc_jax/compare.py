@@ -137,13 +137,15 @@ def require_ours(job: Job) -> None:
 def run(job: Job, steps: int) -> bool:
     """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
     a process of its own, whose memory and compiled programs are gone with it."""
-    (job.folder / EVALUATION).unlink(missing_ok=True)  # not of what is trained now
-    return (
-        call("train", job.train)
-        and trained(job.folder) >= steps  # one stopped by a signal has saved, and says all is well
-        and call("learning", (str(job.folder),))
-        and call("evaluate", job.evaluate)
-    )
+    if trained(job.folder) < steps or not (job.folder / LEARNING).exists():
+        for name in (EVALUATION, LEARNING):
+            (job.folder / name).unlink(missing_ok=True)  # not of what is trained now
+        # A training that was stopped by a signal has saved, and says that all is well.
+        if not (call("train", job.train) and trained(job.folder) >= steps):
+            return False
+        if not call("learning", (str(job.folder),)):
+            return False
+    return call("evaluate", job.evaluate)
 
 
 def trained(run: Path) -> int:
@@ -250,29 +252,30 @@ def _reached(run: Path) -> tuple[str, str, str]:
     return length, f"{records['curriculum/v_max'][-1]:.1f}", after
 
 
-def report(args: Args) -> None:
+def report(args: Args, refused: Sequence[str]) -> None:
     """The table of what is finished, and a copy where one is wanted; OSError, ValueError."""
-    done = finished(args.out)
-    print("mean forward speed [m/s] per command:")
-    Console(highlight=False, markup=False, width=WIDTH).print(table(done))
+    done = [run for run in finished(args.out) if run.name not in refused]
+    if done:
+        print("mean forward speed [m/s] per command:")
+        Console(highlight=False, markup=False, width=WIDTH).print(table(done))
     if args.keep:
         for run_dir in done:
             keep(run_dir, args.keep / run_dir.name)
 
 
-def run_all(args: Args) -> list[str]:
-    """Does what is not done before; the names of what failed."""
+def run_all(args: Args) -> tuple[list[str], list[str]]:
+    """Does what is not done before; the names of what failed, and of what is something else."""
     from kslc_jax.run_folder import RunError
 
-    failed = []
+    failed, refused = [], []
     todo = list(jobs(args))
     for i, job in enumerate(todo):
         name = job.folder.name
         try:
             require_ours(job)
         except (ConfigError, RunError) as error:
-            print(f"error: {job.folder}: {error}; or name another --out", file=sys.stderr)
-            failed.append(name)
+            print(f"error: {job.folder} is not of this comparison: {error}", file=sys.stderr)
+            refused.append(name)
             continue
         if is_done(job, args):
             print(f"[{i + 1}/{len(todo)}] {name}: done before")
@@ -280,7 +283,7 @@ def run_all(args: Args) -> list[str]:
         print(f"[{i + 1}/{len(todo)}] {name}", flush=True)
         if not run(job, args.steps):
             failed.append(name)
-    return failed
+    return failed, refused
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -294,18 +297,20 @@ def main(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
-        failed = run_all(args)
+        failed, refused = run_all(args)
     except KeyboardInterrupt:
         print("stopped; the same command goes on from here", file=sys.stderr)
         return 130
     try:
-        report(args)
+        report(args, refused)
     except (OSError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     if failed:
         print(f"error: failed: {', '.join(failed)}; the same command tries again", file=sys.stderr)
-    return 1 if failed else 0
+    if refused:
+        print(f"error: left alone: {', '.join(refused)}; name another --out", file=sys.stderr)
+    return 1 if failed or refused else 0
 
 
 if __name__ == "__main__":

@@ -33,9 +33,9 @@ def wrap_angle(angle: jax.Array) -> jax.Array:
     return jnp.mod(angle + jnp.pi, 2.0 * jnp.pi) - jnp.pi
 
 
-def norm(x: jax.Array, axis: int = -1) -> jax.Array:
-    """Euclidean norm."""
-    return jnp.sqrt(jnp.sum(jnp.square(x), axis=axis))
+def norm(x: jax.Array) -> jax.Array:
+    """Euclidean norm over the last axis."""
+    return jnp.sqrt(jnp.sum(jnp.square(x), axis=-1))
 
 
 def tree_where(condition: jax.Array, if_true, if_false):

@@ -58,7 +58,7 @@ class PhysicsState:
     )  # [22] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
     qacc_warmstart: jax.Array  # [22] contact solver's start
     sensordata: jax.Array  # [S] named sensors of the model, see Robot.sensor
-    torque: jax.Array  # [16] motor torques of the last physics step [N m]
+    torque: jax.Array  # [16] motor torque less joint friction, last physics step [N m]
 
 
 def robot_for(config: PhysicsConfig) -> Robot:

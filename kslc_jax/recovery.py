@@ -24,6 +24,9 @@ from kslc_jax.train_step import TrainState
 PATIENCE = 10
 """Train steps in a row without one finite update, after which a training goes back."""
 
+ALL_SKIPPED = 0.9999
+"""Share of skipped gradient steps from which all were: a float32 mean of ones may be below 1."""
+
 ATTEMPTS = 3
 """Times that it goes back to the same checkpoint before it gives up."""
 
@@ -72,7 +75,7 @@ class Health:
     def after(self, metrics: dict[str, float]) -> None:
         """Counts bad train steps in a row."""
         self._finite = metrics["finite"] == 1.0
-        learnt = metrics["ppo/skipped"] < 1.0
+        learnt = metrics["ppo/skipped"] < ALL_SKIPPED
         self._bad_steps = 0 if self._finite and learnt else self._bad_steps + 1
 
     def check(self) -> None:

@@ -246,7 +246,7 @@ def _action_change(x: Inputs) -> jax.Array:
 
 
 def torques(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sum of squared motor torques."""
+    """Sum of squared motor torques, less joint friction."""
     return jnp.sum(jnp.square(x.signals.torque))
 
 

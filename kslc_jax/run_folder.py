@@ -123,7 +123,7 @@ def difference(stored: Config, wanted: Config) -> None:
                 walk(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}".lstrip("."))
         elif a != b:
             raise ConfigError(
-                f"{where} is {a} in the run to resume, not {b}: start a new run for that"
+                f"{where} is {a} in the run that is there, not {b}: start a new run for that"
             )
 
     for f in dataclasses.fields(stored):

@@ -226,13 +226,13 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
                 took = time.monotonic() - tick
             record = job.keeper.log(record, step, took)
             health.after(record)
+            if health.good and snapshot_due(job.config, step):
+                job.keeper.keep_snapshot(state)
             stopped, due = devices.agree(stop.requested is not None, job.keeper.due())
             if stopped:
                 stop.requested = stop.requested or "a signal to another process"
                 break
             health.check()
-            if health.good and snapshot_due(job.config, step):
-                job.keeper.keep_snapshot(state)
             if health.good and due:
                 job.keeper.save(devices.whole(state), record)
         if record and health.finite:

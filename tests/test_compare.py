@@ -93,14 +93,22 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, called, capsy
 
 
 @pytest.mark.parametrize(
-    "other",
-    [("--steps", "2500001"), ("--speeds", "2.0"), ("--trials", "4"), ("--fidelity", "train")],
+    ("other", "again"),
+    [
+        (("--steps", "2500001"), "train"),
+        (("--speeds", "2.0"), "evaluate"),
+        (("--trials", "4"), "evaluate"),
+        (("--fidelity", "train"), "evaluate"),
+    ],
 )
-def test_an_answer_to_another_question_does_not_count(tmp_path, called, other):
-    finished_run(tmp_path / "kslc-seed0")
+def test_an_answer_to_another_question_does_not_count(tmp_path, called, other, again):
+    """What was trained does, and the old answer stays until there is another."""
+    run = tmp_path / "kslc-seed0"
+    finished_run(run)
     argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0"]
     assert compare.main(argv) == 0
-    assert compare.main([*argv, *other]) == 1 and called == ["train"]
+    assert compare.main([*argv, *other]) == 1 and called == [again]
+    assert (run / compare.EVALUATION).exists() == (again == "evaluate")
 
 
 @pytest.mark.parametrize("steps", ["2500000", "2500001"], ids=["finished", "to go on with"])
@@ -111,12 +119,13 @@ def test_a_run_of_another_config_is_named_and_left_alone(tmp_path, called, capsy
     other = config.preset("laptop", ("arms",))
     (folder / "config.json").write_text(json.dumps(config.to_dict(other)))
     argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0", "--steps", steps]
-    assert compare.main(argv) == 1 and not called
-    err = capsys.readouterr().err.splitlines()
-    assert err[0].startswith(f"error: {folder}: ") and err[0].endswith("or name another --out")
+    assert compare.main([*argv, "--keep", str(tmp_path / "kept")]) == 1 and not called
+    out = capsys.readouterr()
+    first, last = out.err.splitlines()
+    assert first.startswith(f"error: {folder} is not of this comparison: ")
+    assert last == "error: left alone: kslc-seed0; name another --out"
+    assert out.out == "" and list((tmp_path / "kept").iterdir()) == []
     assert (folder / compare.EVALUATION).exists()
-    (folder / "config.json").write_text(json.dumps(config.to_dict(config.preset("laptop"))))
-    assert compare.main(argv) == (steps != "2500000")
 
 
 def test_a_run_that_trains_on_is_not_done_by_its_old_evaluation(tmp_path, called):
@@ -185,6 +194,7 @@ def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
     job = next(compare.jobs(compare.Args(out=tmp_path, variants=("kslc",))))
     finished_run(job.folder)
     folder = str(job.folder)
+    (job.folder / compare.LEARNING).unlink()
     assert compare.run(job, 2_500_000)
     assert called == [("train", "--preset"), ("learning", folder), ("evaluate", folder)]
     called.clear()

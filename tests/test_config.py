@@ -497,6 +497,24 @@ def test_batch_must_split_into_minibatches():
         dataclasses.replace(PAPER, ppo=dataclasses.replace(PAPER.ppo, minibatches=7))
 
 
+@pytest.mark.parametrize(
+    ("field", "value", "less"),
+    [
+        ("settle_seconds", 8.0, 7.9),  # of the 8 s until the next command
+        ("min_episode_steps", 2400.0, 2399.0),  # of 2400: a moving average never gets there
+    ],
+)
+def test_a_gate_that_could_never_open_is_refused(field, value, less):
+    def gated(x):
+        return dataclasses.replace(
+            PAPER, curriculum=dataclasses.replace(PAPER.curriculum, **{field: x})
+        )
+
+    assert getattr(gated(less).curriculum, field) == less
+    with pytest.raises(ConfigError, match=f"curriculum.{field}"):
+        gated(value)
+
+
 def test_seed_must_not_be_negative():
     with pytest.raises(ConfigError, match="seed"):
         Config(seed=-1)

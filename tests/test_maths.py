@@ -151,7 +151,6 @@ def test_wrap_keeps_the_direction(angle):
 def test_norm():
     assert float(maths.norm(jnp.array([3.0, -4.0, 12.0]))) == 13.0
     np.testing.assert_allclose(maths.norm(jnp.array([[3.0, 4.0], [0.0, -2.0]])), [5.0, 2.0])
-    np.testing.assert_allclose(maths.norm(jnp.array([[3.0, 0.0], [4.0, -2.0]]), axis=0), [5.0, 2.0])
 
 
 @pytest.mark.parametrize("condition", [True, False])

@@ -266,6 +266,21 @@ def test_snapshots_are_spread_over_the_run(parts, due):
     assert [s for s in range(1, 9) if keeper.snapshot_due(config, s)] == due
 
 
+def test_a_stop_where_a_snapshot_is_due_keeps_it(tmp_path, monkeypatch):
+    log = keeper.Keeper.log
+
+    def stopping(self, metrics, step, took):
+        if step == 4:
+            signal.raise_signal(signal.SIGTERM)
+        return log(self, metrics, step, took)
+
+    monkeypatch.setattr(keeper.Keeper, "log", stopping)
+    assert "stopped by SIGTERM at train step 4" in cli(
+        *DEBUG, "--run-dir", tmp_path, "--run.snapshots", 4
+    )
+    assert [path.name for path in learning.snapshots(tmp_path)] == ["2", "4"]
+
+
 @pytest.mark.slow(reason="compiles, simulates and draws in software, half a minute")
 def test_gait_strip(whole, tmp_path):
     """Draws where an off-screen GL is installed; says in one line what to install where not."""

@@ -508,6 +508,16 @@ class Config:
             "(--without arms does)",
         )
         require(
+            self.curriculum.settle_seconds < self.command.resample_seconds,
+            "curriculum.settle_seconds must be below command.resample_seconds: no command would "
+            "ever count",
+        )
+        require(
+            self.curriculum.min_episode_steps < self.episode_steps,
+            f"curriculum.min_episode_steps must be below the {self.episode_steps} steps of "
+            "env.episode_seconds: no episode would ever do",
+        )
+        require(
             self.curriculum.cycle_min <= self.gait.cycle_time,
             "curriculum.cycle_min must not be above gait.cycle_time, where the cycle starts",
         )
