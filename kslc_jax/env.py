@@ -50,7 +50,6 @@ class Outcome:
     truncated: jax.Array  # [] bool: time limit
     broken: jax.Array  # [] bool: the physics diverged; its sample is not to be learnt from
     terms: dict[str, jax.Array]  # raw reward terms, see rewards.TERMS
-    tracking: jax.Array  # [] tracking_lin_vel, share of its maximum
     settled: jax.Array  # [] bool: the command has been the same for a while
     fast: jax.Array  # [] bool: and it was in the top part of the range
     episode_steps: jax.Array  # [] int, length of the episode so far; see train_step.init
@@ -177,7 +176,6 @@ def _outcome(
         truncated=(time >= config.episode_steps) & ~terminated,
         broken=broken,
         terms=terms,
-        tracking=terms["tracking_lin_vel"],
         settled=settled,
         fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
         episode_steps=time,

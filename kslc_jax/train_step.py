@@ -272,8 +272,9 @@ def _progress(out: Outcome) -> Progress:
         count = jnp.sum(mask)
         return jnp.sum(value * mask) / jnp.maximum(count, 1), count
 
-    tracking, tracking_count = mean_over(out.tracking, out.settled)
-    fast_tracking, fast_count = mean_over(out.tracking, out.fast)
+    reached = out.terms["tracking_lin_vel"]  # 1 at its maximum
+    tracking, tracking_count = mean_over(reached, out.settled)
+    fast_tracking, fast_count = mean_over(reached, out.fast)
     episode_steps, episode_count = mean_over(out.episode_steps, done)
     gait, _ = mean_over(out.terms["feet_contact_number"], out.fast)
     return Progress(

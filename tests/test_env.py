@@ -135,7 +135,7 @@ def test_commands_are_resampled_every_8_seconds(setting):
         assert bool(jnp.any(new.command.velocity[:2] != command)) == changes
         error = signals.read(robot, new.physics).base_linvel[:2] - command
         expected = jnp.exp(-config.rewards.tracking_sigma * jnp.sum(error**2))
-        assert float(outcome.tracking) == pytest.approx(float(expected), rel=1e-5)
+        assert float(outcome.terms["tracking_lin_vel"]) == pytest.approx(float(expected), rel=1e-5)
 
 
 def test_tracking_settles_two_seconds_after_a_new_command(setting):

@@ -184,8 +184,8 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
         trace = delta[t] + 0.994 * 0.9 * ~done[t] * trace
         np.testing.assert_allclose(advantage[t], trace, atol=1e-4)
     for name, x, mask in (
-        ("tracking", out.tracking, out.settled),
-        ("fast_tracking", out.tracking, out.fast),
+        ("tracking", out.terms["tracking_lin_vel"], out.settled),
+        ("fast_tracking", out.terms["tracking_lin_vel"], out.fast),
         ("episode_steps", out.episode_steps, done),
         ("gait", out.terms["feet_contact_number"], out.fast),
     ):
