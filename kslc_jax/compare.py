@@ -111,8 +111,8 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 
     folder = args.out / f"{variant}-seed{seed}"
     preset = args.baseline if variant == "baseline" else args.preset
-    without = ("--without", ablation) if ablation else ()
     parts = (ablation,) if ablation else ()
+    without = ("--without", *parts) if parts else ()
     config = dataclasses.replace(config_lib.preset(preset, parts), seed=seed)
     what = ("--preset", preset, *without, "--seed", str(seed))
     length = ("--steps", str(args.steps), "--run.snapshots", str(args.snapshots))

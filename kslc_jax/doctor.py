@@ -78,8 +78,8 @@ def check_devices() -> str:
     """JAX uses the accelerator if there is one."""
     import jax
 
-    if idle := runtime.idle_gpu():
-        raise RuntimeError(idle)
+    if runtime.idle_gpu():
+        raise RuntimeError(runtime.IDLE_GPU)
     return ", ".join(f"{d.platform}: {d.device_kind}" for d in jax.devices())
 
 
@@ -156,7 +156,7 @@ def check_cores() -> str:
 CHECKS: tuple[tuple[str, Callable[[], str], str], ...] = (
     ("python", check_python, f"use Python {TESTED}: make PYTHON=python3.12 train"),
     ("jax", check_jax, runtime.JAX_FIX),
-    ("devices", check_devices, "pip install -e '.[cuda]'"),
+    ("devices", check_devices, runtime.CUDA_FIX),
     ("engines", check_engines, "pip install -e . -c constraints.txt"),
     ("renderer", check_renderer, "apt-get install libegl1 libgl1-mesa-dri (for pictures only)"),
     ("disk", check_disk, f"free {FREE_DISK:g} GiB, or give --run-dir on another disk"),

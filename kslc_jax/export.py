@@ -310,8 +310,7 @@ def main(argv: list[str] | None = None) -> int:
         else:
             args.out.write_bytes(WRITE[args.chosen](policy))
         if args.chosen == "stablehlo":
-            beside = args.out.with_name(args.out.name + ".json")
-            beside.write_text(json.dumps(metadata(policy), indent=1))
+            files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
         print(f"wrote {args.out}, train step {policy.step}")
         print(compare(policy, args.out, args.chosen))
     except (CheckpointError, ConfigError, OSError) as error:

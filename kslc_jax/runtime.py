@@ -20,6 +20,11 @@ JAX_FIX = "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
 """A JAX that does not, as in pyproject.toml."""
 
 
+IDLE_GPU = "there is an NVIDIA GPU, but JAX computes on the CPU"
+
+CUDA_FIX = "pip install 'kslc_jax[cuda]'"
+"""A JAX that computes on it."""
+
 NVIDIA = Path("/dev/nvidia0")
 """There where the driver of an NVIDIA GPU is."""
 
@@ -71,7 +76,7 @@ def idle_gpu() -> str:
 
     if jax.default_backend() != "cpu" or not NVIDIA.exists():
         return ""
-    return "there is an NVIDIA GPU, but JAX computes on the CPU: pip install 'kslc_jax[cuda]'"
+    return f"{IDLE_GPU}: {CUDA_FIX}"
 
 
 class JaxError(RuntimeError):

@@ -19,9 +19,6 @@ from kslc_jax.networks import Params
 FALLEN_SECONDS = 1.0
 """How long a fallen robot lies there before it starts anew."""
 
-DAY = 86_400.0
-"""A session meets no time limit [s]."""
-
 
 @flax.struct.dataclass
 class View:
@@ -93,7 +90,7 @@ class Session:
     def __init__(self, policy: Policy, engine: PhysicsConfig, seed: int = 0):
         self.policy = policy
         self.dt = engine.control_dt
-        self._config = trials.trial_config(policy.config, trials.Setting(engine, seconds=DAY), 1)
+        self._config = trials.trial_config(policy.config, trials.Setting(engine), 1)
         self._key_reset, self._key_step = jax.random.split(jax.random.key(seed))
         self._steps = self._resets = 0
         self.reset()

@@ -27,6 +27,10 @@ FARTHEST = 3.0
 """How far [rad] a wanted heading lies ahead of the robot at most."""
 
 
+FOREVER = 864_000.0
+"""Time [s] that no trial and no session lasts: ten days."""
+
+
 @dataclass(frozen=True)
 class Setting:
     """Under what conditions a policy is tried."""
@@ -69,15 +73,12 @@ def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
     """The policy's config under the setting's conditions: fixed commands, no time limit."""
     quiet = {} if setting.noise else {"noise_level": 0.0, "action_delay": 0.0, "action_noise": 0.0}
-    seconds = 10.0 * setting.seconds
-    no_gate = {"settle_seconds": 0.0, "min_episode_steps": 0.0}  # episodes may be shorter than it
     return dataclasses.replace(
         config,
         physics=setting.physics,
         randomize=setting.randomize,
-        env=dataclasses.replace(config.env, num_envs=count, episode_seconds=seconds, **quiet),
-        command=dataclasses.replace(config.command, resample_seconds=seconds),
-        curriculum=dataclasses.replace(config.curriculum, **no_gate),
+        env=dataclasses.replace(config.env, num_envs=count, episode_seconds=FOREVER, **quiet),
+        command=dataclasses.replace(config.command, resample_seconds=FOREVER),
         ppo=dataclasses.replace(config.ppo, minibatches=1),
     )
 
