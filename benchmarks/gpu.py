@@ -1,89 +1,76 @@
-"""All that is worth knowing about a machine with an accelerator, in one go of minutes; no network.
+"""Control steps/s on a machine with an accelerator, in one go of minutes; no network.
 
-1. Control steps/s of physics alone, of the rollout and of whole training, over environments.
-2. Whole training at other matrix-product precisions of networks and signals (the physics always
-   computes in full float32).
-3. Training until the time is up, from the start or from what an earlier go left.
+Of each case, ENGINE:ENVIRONMENTSxSTEPS, it measures physics alone, the rollout and whole training;
+then whole training at other matrix-product precisions of networks and signals (the physics always
+computes in full float32). All programs are compiled first, at the same time, on all cores; a case
+that fails is told and leaves the others alone.
 
-The folder `--out` then holds three files, small enough to carry away: `results.json`,
-`metrics.jsonl` and `checkpoint.tgz`. Unpacked, the last is a checkpoint without environments: all
-of `evaluate`, `play` and `export` take it, and so does `--start` here.
-
-  python -m benchmarks.gpu --out go1 [--minutes 8.5] [--num-envs 4096 1024 8192 16384 2048]
-  python -m benchmarks.gpu --out go2 --start go1/checkpoint.tgz --only-train
-  python -m benchmarks.gpu --out tiny --tiny        # does it run? On any machine
+  python -m benchmarks.gpu --out gpu.json
+  python -m benchmarks.gpu --preset paper --cases mjx:4096x60 --out paper.json
+  python -m benchmarks.gpu --preset debug --cases mjx:16x8 --precisions --repeats 1   # anywhere
 """
 
-import contextlib
 import dataclasses
-import json
-import shutil
-import tarfile
-import tempfile
+import os
+import re
+import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import jax
-import orbax.checkpoint as ocp
 import tyro
 
 from benchmarks import throughput, timing
-from kslc_jax import checkpoint, memory, train_step
-from kslc_jax.checkpoint import BEST_METRIC, Store
-from kslc_jax.config import Config, preset
-from kslc_jax.train_step import TrainState
+from kslc_jax import runtime
+from kslc_jax.config import Config, ConfigError, preset
 
 Run = Callable[[], Any]
-
-START = time.monotonic()
-
-MEASURING = 0.6
-"""Share of the time after which no new measurement is begun."""
+Part = Literal["physics only", "rollout", "whole training"]
 
 
-def first_calls(makes: dict[str, Callable[[], Run]]) -> dict[str, Run]:
-    """Makes all runs and calls each once, at the same time: XLA compiles one program a core."""
-
-    def one(make: Callable[[], Run]) -> Run:
-        run = make()
-        run()
-        return run
-
-    with ThreadPoolExecutor() as pool:
-        return dict(zip(makes, pool.map(one, makes.values()), strict=True))
+def shaped(base: Config, case: str) -> Config:
+    """`base` with a case's engine, number of environments and steps of a rollout."""
+    found = re.fullmatch(r"(mjx|mujoco):(\d+)x(\d+)", case)
+    if found is None:
+        raise ConfigError(f"{case!r} is no case: mjx:2048x24 is one")
+    engine, envs, steps = found[1], int(found[2]), int(found[3])
+    config = timing.resized(timing.on_engine(base, engine), envs)
+    return dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout_steps=steps))
 
 
-def throughputs(config: Config, repeats: int) -> dict[str, float]:
-    """Control steps/s of each part, and the seconds that all of them took to compile."""
-    start = time.monotonic()
-    runs = first_calls({name: lambda m=make: m(config) for name, make in throughput.PARTS.items()})
-    compiling = time.monotonic() - start
-    seconds = timing.medians(timing.in_turn(runs, repeats))
-    rates = {name: config.batch_size / s for name, s in seconds.items()}
-    return {**rates, "compile seconds, in parallel": compiling}
+def at_precision(config: Config, name: str) -> Run:
+    """Whole training under a matrix-product precision."""
+    run = throughput.training(config)
 
-
-def precisions(config: Config, names: Iterable[str], repeats: int) -> dict[str, float]:
-    """Control steps/s of whole training under each matrix-product precision."""
-
-    def make(name: str) -> Run:
+    def again() -> None:
         with jax.default_matmul_precision(name):
-            run = throughput.training(config)
             run()
 
-        def again() -> None:
-            with jax.default_matmul_precision(name):
-                run()
+    return again
 
-        return again
 
-    runs = first_calls({name: lambda n=name: make(n) for name in names})
-    seconds = timing.medians(timing.in_turn(runs, repeats))
-    return {name: config.batch_size / s for name, s in seconds.items()}
+def first_calls(makes: Mapping[str, Callable[[], Run]]) -> dict[str, Run]:
+    """Makes all runs and calls each once, at the same time: XLA compiles one program a core."""
+
+    def one(name: str) -> Run | None:
+        start = time.monotonic()
+        try:
+            run = makes[name]()
+            run()
+        except Exception as error:
+            print(f"{name}: {runtime.first_line(error)}", flush=True)
+            return None
+        print(f"{name}: compiled after {time.monotonic() - start:.0f} s", flush=True)
+        return run
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        runs = dict(zip(makes, pool.map(one, makes), strict=True))
+    return {name: run for name, run in runs.items() if run is not None}
 
 
 def peak_gib() -> float | None:
@@ -92,136 +79,55 @@ def peak_gib() -> float | None:
     return stats["peak_bytes_in_use"] / 2**30 if "peak_bytes_in_use" in stats else None
 
 
-def measure(args: "Args", base: Config, deadline: float) -> dict[str, Any]:
-    """Steps 1 and 2, as much of them as there is time for."""
-    sizes: dict[str, Any] = {}
-    longest = 0.0
-    for n in args.num_envs:
-        begun = time.monotonic()
-        if begun + longest > deadline:
-            break
-        sizes[str(n)] = throughputs(timing.resized(base, n), args.repeats)
-        sizes[str(n)]["peak GiB so far"] = peak_gib()
-        longest = max(longest, time.monotonic() - begun)
-        print(n, "environments:", sizes[str(n)], flush=True)
-    result = {"num_envs": sizes}
-    if time.monotonic() + longest < deadline:
-        result["precision"] = precisions(base, args.precisions, args.repeats)
-        print("precisions:", result["precision"], flush=True)
-    return result
-
-
-def start_from(archive: Path, state: TrainState) -> TrainState:
-    """`state` with everything but the environments as an earlier go left it."""
-    with tempfile.TemporaryDirectory() as folder:
-        with tarfile.open(archive) as file:
-            file.extractall(folder, filter="data")
-        (found,) = Path(folder).iterdir()
-        parts = checkpoint._split(state)
-        items = {
-            name: ocp.args.StandardRestore(checkpoint._abstract(parts[name]))
-            for name in ("params", "core")
-        }
-        with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
-            kept = reader.restore(found, args=ocp.args.Composite(**items))
-    return checkpoint._join({"env": state.env, **{name: kept[name] for name in items}}, state)
-
-
-def keep(out: Path, config: Config, state: TrainState, metrics: dict[str, float]) -> None:
-    """Writes `checkpoint.tgz`: a checkpoint without its environments."""
-    with tempfile.TemporaryDirectory() as folder:
-        with contextlib.closing(Store(Path(folder))) as store:
-            store.save(state, config, metrics)
-        saved = Path(folder) / checkpoint.FOLDER / str(int(state.step))
-        shutil.rmtree(saved / "env")
-        whole = out / "checkpoint.tgz.part"
-        with tarfile.open(whole, "w:gz") as file:
-            file.add(saved, arcname=saved.name)
-        whole.replace(out / "checkpoint.tgz")
-
-
-def train(args: "Args", config: Config, deadline: float) -> dict[str, Any]:
-    """Step 3; what it came to."""
-    init, step = train_step.make(config)
-    state = init()
-    if args.start is not None:
-        state = start_from(args.start, state)
-    begun = time.monotonic()
-    compiled = step.lower(state).compile()
-    result = {"compile seconds": time.monotonic() - begun, "first step": int(state.step) + 1}
-    like = jax.eval_shape(init)
-    result["GiB estimated"] = memory.estimate(config, like) / 2**30
-    used = memory.measured(compiled)
-    if used is not None:
-        result["GiB by XLA"] = used / 2**30
-    begun, done, saved = time.monotonic(), 0, time.monotonic()
-    record: dict[str, float] = {}
-    with (args.out / "metrics.jsonl").open("w") as file:
-        while done < args.train_steps and time.monotonic() < deadline:
-            state, metrics = compiled(state)
-            record = {name: float(value) for name, value in jax.device_get(metrics).items()}
-            record |= {"seconds": time.monotonic() - begun}
-            record |= {BEST_METRIC: record["curriculum/v_max"] + record["curriculum/tracking"]}
-            file.write(json.dumps(record) + "\n")
-            file.flush()
-            done += 1
-            if time.monotonic() - saved > args.save_seconds:
-                saved = time.monotonic()
-                keep(args.out, config, state, record)
-    seconds = time.monotonic() - begun
-    if done:
-        keep(args.out, config, state, record)
-    return {**result, "steps": done, "steps per second": done * config.batch_size / seconds}
-
-
 @dataclass(frozen=True)
 class Args:
-    """Measures a machine with an accelerator and trains on it."""
+    """Measures a machine with an accelerator."""
 
-    out: Path
-    """Folder for the three files."""
-    preset: str = "paper"
-    """Whose sizes to use."""
-    engine: Literal["mjx", "mujoco"] = "mjx"
-    """Physics engine."""
-    minutes: float = 8.5
-    """When to stop, counted from the start of this program."""
-    num_envs: tuple[int, ...] = (4096, 1024, 8192, 16384, 2048)
-    """Environments, the most wanted first: where time is short the last are left out."""
-    precisions: tuple[str, ...] = ("float32", "tensorfloat32", "bfloat16")
-    """Matrix-product precisions."""
+    out: Path | None = None
+    """File for the numbers."""
+    preset: str = "laptop"
+    """Whose networks, and all else that a case leaves open."""
+    cases: tuple[str, ...] = ("mjx:2048x24", "mjx:4096x12", "mjx:8192x6")
+    """ENGINE:ENVIRONMENTSxSTEPS. The three have the laptop preset's samples in a batch."""
+    parts: tuple[Part, ...] = ("physics only", "rollout", "whole training")
+    """What to measure of each case."""
+    precisions: tuple[str, ...] = ("tensorfloat32", "float32")
+    """Matrix-product precisions at which the first case trains besides."""
     repeats: int = 5
-    """Timed calls of each part."""
-    train_steps: int = 10**9
-    """Most train steps, if the time does not end first."""
-    save_seconds: float = 120.0
-    """Time between two checkpoints."""
-    start: Path | None = None
-    """checkpoint.tgz of an earlier go to train on from."""
-    only_train: bool = False
-    """Leave the measurements out."""
-    tiny: bool = False
-    """Seconds instead of minutes: the debug preset's sizes, everything once."""
-
-
-TINY = {"preset": "debug", "num_envs": (16, 32), "precisions": ("float32",), "repeats": 1}
+    """Timed calls of each."""
 
 
 def main(args: Args) -> None:
-    """Measures, trains, writes."""
-    if args.tiny:
-        args = dataclasses.replace(args, **TINY, train_steps=2)
-    args.out.mkdir(parents=True, exist_ok=True)
-    config = timing.on_engine(preset(args.preset), args.engine)
-    seconds = 60.0 * args.minutes
-    result: dict[str, Any] = {"preset": args.preset, "engine": args.engine}
-    if not args.only_train:
-        result |= measure(args, config, START + MEASURING * seconds)
-        timing.report(result, args.out / "results.json")
-    result["training"] = train(args, config, START + seconds)
-    result["peak GiB"] = peak_gib()
-    print("training:", result["training"])
-    timing.report(result, args.out / "results.json")
+    """Compiles all, measures in turn, prints a line each."""
+    try:
+        configs = {case: shaped(preset(args.preset), case) for case in args.cases}
+    except ConfigError as error:
+        sys.exit(f"error: {error}")
+    makes: dict[str, Callable[[], Run]] = {}
+    sizes = {}
+    for case, config in configs.items():
+        for part in args.parts:
+            makes[f"{case} {part}"] = partial(throughput.PARTS[part], config)
+            sizes[f"{case} {part}"] = config.batch_size
+    first = configs[args.cases[0]]
+    for name in args.precisions:
+        makes[name] = partial(at_precision, first, name)
+        sizes[name] = first.batch_size
+    start = time.monotonic()
+    runs = first_calls(makes)
+    compiling = time.monotonic() - start
+    seconds = timing.medians(timing.in_turn(runs, args.repeats))
+    rates = {name: sizes[name] / s for name, s in seconds.items()}
+    for name, rate in rates.items():
+        print(f"{name:32} {rate:10.0f} steps/s")
+    print(f"{len(runs)} programs compiled in {compiling:.0f} s; peak {peak_gib()} GiB")
+    result = {
+        "preset": args.preset,
+        "steps per second": rates,
+        "compile seconds, in parallel": compiling,
+        "peak GiB": peak_gib(),
+    }
+    timing.report(result, args.out)
 
 
 if __name__ == "__main__":

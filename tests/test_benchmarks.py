@@ -4,7 +4,6 @@ import gzip
 import json
 import subprocess
 import sys
-import tarfile
 from types import SimpleNamespace
 
 import jax
@@ -12,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import kslc_jax
 from benchmarks import compile_time, gpu, memory, parts, purejaxrl, throughput, timeline, timing
 from kslc_jax import observations, physics, randomize, signals, train_step
 from kslc_jax.config import preset
@@ -188,22 +186,33 @@ def test_compile_time_and_memory(tmp_path, capsys):
     assert "0 minutes are over: 1 points are left out" in capsys.readouterr().out
 
 
-@pytest.mark.slow(reason="compiles MJX, a minute or two on two cores")
+@pytest.mark.slow(reason="compiles MJX, a minute on two cores")
 def test_gpu_in_small(tmp_path):
-    """All of it on any machine; what it leaves is small, loads as a policy, and trains on."""
-    gpu.main(gpu.Args(tmp_path / "go1", tiny=True))
-    result = json.loads((tmp_path / "go1" / "results.json").read_text())
-    assert set(result["num_envs"]) == {"16", "32"} and result["precision"]["float32"] > 0
-    assert all(r["whole training"] > 0 for r in result["num_envs"].values())
-    assert result["training"]["steps"] == 2
-    kept = tmp_path / "go1" / "checkpoint.tgz"
-    with tarfile.open(kept) as file:
-        file.extractall(tmp_path, filter="data")
-    assert kslc_jax.load_policy(tmp_path / "2").config == timing.on_engine(preset("debug"), "mjx")
-    again = gpu.Args(tmp_path / "go2", tiny=True, start=kept, only_train=True)
-    gpu.main(again)
-    rows = (tmp_path / "go2" / "metrics.jsonl").read_text().splitlines()
-    assert [json.loads(row)["step"] for row in rows] == [3, 4]
+    """On any machine: a rate for each part of each case, and for the other precision."""
+    cases, parts = ("mjx:16x8", "mujoco:32x4"), ("physics only", "whole training")
+    out = tmp_path / "gpu.json"
+    gpu.main(gpu.Args(out, "debug", cases, parts, ("float32",), repeats=1))
+    rates = json.loads(out.read_text())["steps per second"]
+    assert set(rates) == {f"{c} {p}" for c in cases for p in parts} | {"float32"}
+    assert min(rates.values()) > 0
+
+
+def test_gpu_cases():
+    config = gpu.shaped(preset("laptop"), "mjx:4096x12")
+    assert config.physics.engine == "mjx"
+    assert (config.env.num_envs, config.ppo.rollout_steps) == (4096, 12)
+    for wrong in ("mjx", "mjx:4096", "mjx:manyx12", "mjx:1x1"):
+        with pytest.raises(SystemExit, match=r"^error: "):
+            gpu.main(gpu.Args(cases=(wrong,)))
+
+
+def test_gpu_goes_on_without_what_fails(capsys):
+    def fails():
+        raise RuntimeError("out of memory\nand so on")
+
+    runs = gpu.first_calls({"large": fails, "small": lambda: lambda: 3})
+    assert list(runs) == ["small"] and runs["small"]() == 3
+    assert "large: out of memory\n" in capsys.readouterr().out
 
 
 @pytest.mark.slow(reason="compiles MJX three times and starts worker processes")
