@@ -63,13 +63,6 @@ def first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
-def auto_preset() -> str:
-    """'paper' where JAX has an accelerator, 'laptop' without one."""
-    import jax
-
-    return "laptop" if jax.default_backend() == "cpu" else "paper"
-
-
 def idle_gpu() -> str:
     """What to say where an NVIDIA GPU is there that JAX does not use; empty where there is none."""
     import jax

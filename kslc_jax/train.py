@@ -6,7 +6,7 @@ config, versions, metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves 
 named before --help.
 
 Examples:
-  python -m kslc_jax.train                          # paper preset on a GPU, laptop preset without
+  python -m kslc_jax.train                          # the laptop preset, on a GPU if there is one
   python -m kslc_jax.train --preset debug           # seconds, to see that everything works
   python -m kslc_jax.train --preset laptop --without arms --seed 1
   python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
@@ -33,14 +33,16 @@ from kslc_jax.config import Config, ConfigError
 if TYPE_CHECKING:
     from jax.sharding import Mesh
 
+DEFAULT = "laptop"
+"""The preset of a training that names none."""
+
 
 @dataclass(frozen=True)
 class Args:
     """Command line of a training."""
 
-    preset: str = "auto"
-    """auto, paper, laptop, debug, baseline or baseline-laptop. auto is paper on an accelerator,
-    laptop without one."""
+    preset: str = DEFAULT
+    """paper, laptop, debug, baseline or baseline-laptop."""
     without: tuple[str, ...] = ()
     """What to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
@@ -66,7 +68,7 @@ class Args:
     """How many processes there are, with --coordinator host:port."""
     process_index: int | None = None
     """Which of them this is, from 0. The first one reads, writes and speaks."""
-    config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS["laptop"]
+    config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS[DEFAULT]
     """Every number of the training, as the preset has it."""
 
 
@@ -105,7 +107,7 @@ def cluster(
 def parse(argv: list[str]) -> Args:
     """Args, with `config` made of preset or stored config, ablations and overrides; ConfigError."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset", default="auto")
+    early.add_argument("--preset")
     early.add_argument("--without", nargs="*", default=[])
     early.add_argument("--run-dir", "--run_dir", type=Path)
     early.add_argument("--resume", action="store_true")
@@ -113,15 +115,12 @@ def parse(argv: list[str]) -> Args:
     helping = "-h" in argv or "--help" in argv
     if known.resume and known.run_dir is None and not helping:
         raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
-    if known.resume and not helping and known.preset == "auto" and not known.without:
+    if known.resume and not helping and known.preset is None and not known.without:
         from kslc_jax import run_folder
 
         base = run_folder.read_config(known.run_dir)
     else:  # also on resume: the runner names what the stored config has otherwise
-        name = known.preset
-        if name == "auto":
-            name = "laptop" if helping else runtime.auto_preset()
-        base = config_lib.preset(name, tuple(known.without))
+        base = config_lib.preset(known.preset or DEFAULT, tuple(known.without))
     args = tyro.cli(Args, args=argv, default=Args(config=base), description=__doc__)
     if args.resume and args.start_from:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
@@ -137,13 +136,9 @@ def headline(args: Args) -> tuple[str, Path]:
     """What is about to run, in a few words, and its run folder."""
     if args.resume and args.run_dir is not None:
         return "resuming", args.run_dir
-    name, why = args.preset, ""
-    if name == "auto":
-        name = runtime.auto_preset()
-        why = f" (auto: {'an' if name == 'paper' else 'no'} accelerator)"
-    name = "-no-".join([name, *args.without])
+    name = "-no-".join([args.preset, *args.without])
     folder = args.run_dir or Path("runs") / f"{name}-seed{args.config.seed}"
-    return f"preset {name}{why}", folder
+    return f"preset {name}", folder
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -113,7 +113,7 @@ class TestTrain:
         assert f"--{name}" in self.refused(run_dir, f"--{name}", word)
 
     @few
-    @given(words.filter(lambda w: w not in PRESETS and w != "auto"))
+    @given(words.filter(lambda w: w not in PRESETS))
     def test_unknown_names(self, run_dir, word):
         assert word in refused(train.main, "--preset", word, "--run-dir", run_dir / "new")
         assert word in self.refused(run_dir, "--without", word)
