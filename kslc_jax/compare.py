@@ -248,7 +248,7 @@ def _reached(run: Path) -> tuple[str, str, str]:
     records = plots.read_metrics(run)
     length, after = f"{records['env_steps'][-1] / 1e6:.1f} M", "start"
     for _, steps, seconds in plots.milestones(records):
-        after = f"{steps / 1e6:.1f} M, {seconds / 60:.0f} min"
+        after = f"{steps / 1e6:.1f} M, {plots.in_minutes(seconds)}"
     return length, f"{records['curriculum/v_max'][-1]:.1f}", after
 
 

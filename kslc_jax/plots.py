@@ -83,6 +83,12 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
     return [(v[i], records["env_steps"][i], records["seconds"][i]) for i in growth(records)]
 
 
+def in_minutes(seconds: float) -> str:
+    """'34 min', of less than ten '1.5 min': what a GPU takes."""
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes >= 10.0 else f"{minutes:.1f} min"
+
+
 def learning_curve(runs: dict[str, Records], out: Path) -> None:
     """One panel per quantity, one line per run; the first run's milestones tell its wall time."""
     figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True, layout="constrained")
@@ -100,7 +106,7 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
     first = next(iter(runs.values()))
     for v, steps, seconds in milestones(first):
         axes[0].annotate(
-            f"{v:.1f} m/s\n{seconds / 60:.0f} min",
+            f"{v:.1f} m/s\n{in_minutes(seconds)}",
             (steps / 1e6, v),
             textcoords="offset points",
             xytext=(4, -16),
@@ -334,7 +340,7 @@ def _training(args: Training) -> None:
     for run, records in runs.items():
         print(run)
         for v, steps, seconds in milestones(records):
-            print(f"  v_max {v:.1f} m/s at {steps / 1e6:5.1f} M steps, {seconds / 60:3.0f} min")
+            print(f"  v_max {v:.1f} m/s at {steps / 1e6:5.1f} M steps, {in_minutes(seconds):>7}")
     learning_curve(runs, args.out)
 
 

@@ -4,6 +4,8 @@ import itertools
 import json
 from pathlib import Path
 
+import pytest
+
 from kslc_jax import compare, plots
 from kslc_jax.checkpoint import POLICIES
 
@@ -36,15 +38,19 @@ def conditions(name: str) -> dict:
     return json.loads((DOCS / "results" / f"{name}.json").read_text())["conditions"]
 
 
-def test_high_fidelity():
-    head, *rows = table("Full C MuJoCo, high fidelity")
-    stored = conditions("sim2sim")["nominal"]
+@pytest.mark.parametrize(
+    ("section", "name"),
+    [("Full C MuJoCo, high fidelity", "sim2sim"), ("On a GPU", "h200-sim2sim")],
+)
+def test_high_fidelity(section, name):
+    head, *rows = table(section)
+    stored = conditions(name)["nominal"]
     assert set(head) == {"command [m/s]", *FORMS} and len(rows) == len(stored)
     for cells, numbers in zip(rows, stored, strict=True):
         assert cells[0] == f"{numbers['command']:.1f}"
         for label, cell in zip(head[1:], cells[1:], strict=True):
-            name, form = FORMS[label]
-            assert cell == (form.format(numbers[name]) if name in numbers else "-"), (label, cells)
+            key, form = FORMS[label]
+            assert cell == (form.format(numbers[key]) if key in numbers else "-"), (label, cells)
 
 
 def test_perturbed():
