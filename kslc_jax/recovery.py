@@ -49,6 +49,12 @@ class WentBad(Exception):
         self.before = before
 
 
+@jax.jit
+def _copy(state: TrainState) -> TrainState:
+    """One program; one for each of a hundred leaves would keep a GPU waiting."""
+    return jax.tree.map(jnp.copy, state)
+
+
 class Health:
     """Whether a training's numbers are good, from each train step's metrics."""
 
@@ -70,7 +76,7 @@ class Health:
     def before(self, state: TrainState) -> None:
         """Keeps a copy, for the step donates `state`; during bad steps the one before them."""
         if self.good:
-            self._before = jax.tree.map(jnp.copy, state)
+            self._before = _copy(state)
 
     def after(self, metrics: dict[str, float]) -> None:
         """Counts bad train steps in a row."""
