@@ -7,7 +7,7 @@
 | `parts` | where the time of a train step goes |
 | `compile_time` | first start and later starts |
 | `memory` | peak memory and speed over environments and frames |
-| `gpu` | all that matters on a machine with an accelerator, in one go |
+| `gpu` | `throughput` of several sizes and precisions on an accelerator, in one go |
 | `start_test`, `kill_test` | not speed: hundreds of starts, hundreds of kills |
 
 Each prints a table, and the first five keep the numbers with `--json`.
