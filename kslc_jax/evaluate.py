@@ -35,6 +35,12 @@ HEADLINE = (
     ("momentum_yaw_rms", "Lz rms", "{:.2f}"),
 )
 
+BESIDE = (
+    ("lateral_mean", "mean vy [m/s]", "{:.2f}"),
+    ("yaw_rate_mean", "mean yaw rate [rad/s]", "{:.2f}"),
+)
+"""What is asked beside a forward speed: side step and turn."""
+
 MOST_SAMPLES = 2_000_000
 """Control steps of all trials whose traces are held in memory at once, about 300 bytes each."""
 
@@ -89,6 +95,7 @@ def measure(
     seed: int = 0,
     progress=lambda share: None,
     describe=None,
+    beside: tuple[float, float] = (0.0, 0.0),
 ) -> list[dict[str, float]]:
     """One row of metrics per commanded forward speed [m/s], over `seeds` trials each.
 
@@ -100,6 +107,7 @@ def measure(
       seed: of initial states and randomisation.
       progress: told the share that is done.
       describe: the metrics of a trace; None: all of them, `gait_metrics.summary`.
+      beside: side step [m/s, to the left] and turn [rad/s, to the left] commanded with every speed.
     """
     import jax
     import numpy as np
@@ -112,8 +120,7 @@ def measure(
     rows = []
     for start in range(0, len(speeds), at_once):
         group = speeds[start : start + at_once]
-        velocities = np.zeros((len(group) * seeds, 3))
-        velocities[:, 0] = np.repeat(group, seeds)
+        velocities = np.array([(speed, *beside) for speed in group for _ in range(seeds)])
         pieces = []
         for piece in trials.run(policy, setting, velocities, seed):
             pieces.append(piece)
@@ -136,16 +143,16 @@ def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, flo
     return measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
 
 
-def table(rows: list[dict[str, float]], title: str):
-    """The headline numbers as a rich table."""
+def table(rows: list[dict[str, float]], title: str, columns=HEADLINE):
+    """The numbers of those columns as a rich table."""
     from rich.table import Table
 
     out = Table(title=title, title_justify="left")
     out.add_column("command [m/s]", justify="right")
-    for _, label, _ in HEADLINE:
+    for _, label, _ in columns:
         out.add_column(label, justify="right")
     for row in rows:
-        cells = [form.format(row[name]) if name in row else "-" for name, _, form in HEADLINE]
+        cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
         out.add_row(f"{row['command']:.1f}", *cells)
     return out
 

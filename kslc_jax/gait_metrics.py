@@ -82,6 +82,8 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
             out |= _interval(name, x)
         out |= {
             "forward_bias": float(mean[upright].mean() - command),
+            "lateral_mean": float(linvel[..., 1].mean()),
+            "yaw_rate_mean": float(angvel[..., 2].mean()),
             "roll_deg": float(np.degrees(np.abs(s.euler[..., 0]).mean())),
             "pitch_deg": float(np.degrees(s.euler[..., 1].mean())),
         }

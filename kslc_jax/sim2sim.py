@@ -12,6 +12,7 @@ Examples:
   python -m kslc_jax.sim2sim runs/laptop-seed0
   python -m kslc_jax.sim2sim runs/laptop-seed0 --noise --latency --perturb all --json out.json
   python -m kslc_jax.sim2sim runs/laptop-seed0 --perturb friction=0.2 payload=8 --speeds 1 2
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --speeds -0.3 0 0.5 --turn 1
   python -m kslc_jax.sim2sim runs/laptop-seed0 --engine drake --seconds 20 --seeds 2
 """
 
@@ -66,6 +67,10 @@ class Args:
     (pip install 'kslc_jax[drake]')."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Commanded forward speeds [m/s]."""
+    sideways: float = 0.0
+    """Side step commanded with every speed [m/s], to the left."""
+    turn: float = 0.0
+    """Yaw rate commanded with every speed [rad/s], to the left; 0 keeps the heading."""
     seeds: int = 32
     """Trials per speed."""
     seconds: float = 60.0
@@ -86,6 +91,8 @@ class Args:
     def __post_init__(self):
         evaluate.check(self.speeds, self.seeds, self.seconds)
         require_seed(self.seed)
+        if not all(map(math.isfinite, (self.sideways, self.turn))):
+            raise ConfigError("sideways and turn must be finite")
         for name in self.conditions:
             changes(name)
 
@@ -158,6 +165,7 @@ def sweeps(args: Args, policy, progress=lambda condition, share: None) -> Result
             args.seeds,
             args.seed,
             lambda share, condition=condition: progress(condition, share),
+            beside=(args.sideways, args.turn),
         )
         for condition in args.conditions
     }
@@ -211,13 +219,17 @@ def _report(args: Args) -> None:
 
         results = sweeps(args, policy, progress)
     title = f"{args.policy}, train step {policy.step}, {args.engine}"
+    columns = evaluate.HEADLINE
+    if args.sideways or args.turn:
+        title += f", with {args.sideways:g} m/s sideways and {args.turn:g} rad/s"
+        columns = (*columns[:3], *evaluate.BESIDE, *columns[3:])
     for condition, rows in results.items():
-        screen.print(evaluate.table(rows, f"{title}, {condition}"))
+        screen.print(evaluate.table(rows, f"{title}, {condition}", columns))
     if len(results) > 1:
         screen.print(summary(results, title))
     if args.json is not None:
         what = {"policy": str(args.policy), "step": policy.step}
-        names = ("engine", "seeds", "seconds", "noise", "latency", "seed")
+        names = ("engine", "sideways", "turn", "seeds", "seconds", "noise", "latency", "seed")
         how = {name: getattr(args, name) for name in names}
         files.write_json(args.json, {**what, **how, "conditions": results})
 

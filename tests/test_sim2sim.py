@@ -15,6 +15,7 @@ from kslc_jax import (
     curriculum,
     env,
     evaluate,
+    gait_metrics,
     networks,
     randomize,
     robot,
@@ -144,7 +145,8 @@ def test_a_sweep_too_large_for_memory_goes_speed_by_speed(random_policy, frozen,
 def test_report(random_policy, monkeypatch, tmp_path, capsys):
     """One table per condition, a summary, and JSON that holds every row."""
 
-    def measure(policy, setting, speeds, seeds, seed, progress):
+    def measure(policy, setting, speeds, seeds, seed, progress, beside):
+        assert beside == (0.0, 0.0)
         progress(1.0)
         extra = setting.randomize.base_mass[0]
         return [{"command": v, "survival": 0.5, "forward_mean": v - extra} for v in speeds]
@@ -155,10 +157,31 @@ def test_report(random_policy, monkeypatch, tmp_path, capsys):
     argv = ["p", "--speeds", "1", "2", "--perturb", "payload=0.25", "--latency", "--json", str(out)]
     assert sim2sim.main(argv) == 0
     shown = capsys.readouterr().out
-    assert shown.count("payload=0.25") == 2 and "50% 1.75" in shown
+    assert shown.count("payload=0.25") == 2 and "50% 1.75" in shown and "vy [m/s]" not in shown
     kept = json.loads(out.read_text())
     assert kept["latency"] and not kept["noise"] and kept["engine"] == "mujoco"
     assert [r["forward_mean"] for r in kept["conditions"]["payload=0.25"]] == [0.75, 1.75]
+
+
+def test_a_side_step_and_a_turn_are_commanded_with_every_speed(random_policy, monkeypatch, capsys):
+    """And shown: what was asked for, and what came of it."""
+    asked = []
+
+    def run(policy, setting, velocities, seed):
+        asked.append(velocities)
+        yield velocities
+
+    monkeypatch.setattr(trials, "run", run)
+    monkeypatch.setattr(trials, "join", lambda pieces: pieces[0])
+    found = {"lateral_mean": 0.29, "yaw_rate_mean": -0.98}
+    monkeypatch.setattr(gait_metrics, "summary", lambda trace, speed, robot, dt: found)
+    monkeypatch.setattr(checkpoint, "load_policy", lambda path: random_policy)
+    argv = ["p", "--speeds", "0", "0.5", "--seeds", "2", "--sideways", "0.3", "--turn", "-1"]
+    assert sim2sim.main(argv) == 0
+    expected = [[0, 0.3, -1], [0, 0.3, -1], [0.5, 0.3, -1], [0.5, 0.3, -1]]
+    np.testing.assert_array_equal(asked, [expected])
+    shown = capsys.readouterr().out
+    assert "0.3 m/s sideways and -1 rad/s" in shown and "0.29" in shown and "-0.98" in shown
 
 
 @pytest.mark.parametrize(
@@ -166,6 +189,7 @@ def test_report(random_policy, monkeypatch, tmp_path, capsys):
     [
         (["no-such-policy"], "no run, checkpoint or shipped policy"),
         (["x", "--seconds", "2"], "seconds must be a whole number from 3"),
+        (["x", "--turn", "nan"], "sideways and turn must be finite"),
         (["x", "--seeds", "0"], "seeds must be positive"),
         (["x", "--perturb", "wind=3"], "cannot read 'wind=3'"),
     ],

@@ -244,17 +244,18 @@ def test_a_row_is_of_its_command_and_conditions(still, monkeypatch):
 
 
 def test_speed_numbers():
-    """2 s at rest that do not count, then 1 and 3 m/s +- 0.5, +- 0.2 aside, +- 0.4 rad/s."""
+    """2 s at rest do not count, then 1 and 3 m/s +- 0.5, 0.1 +- 0.2 aside, -0.3 +- 0.4 rad/s."""
     trace = synthetic()
     sign = np.where(np.arange(len(trace.alive)) % 2, 1.0, -1.0)[:, None] * np.ones(2)
-    linvel = np.stack([np.array([1.0, 3.0]) + 0.5 * sign, 0.2 * sign, 9.0 * sign], -1)
+    linvel = np.stack([np.array([1.0, 3.0]) + 0.5 * sign, 0.1 + 0.2 * sign, 9.0 * sign], -1)
     linvel[:200] = 0.0
-    angvel = np.stack([9.0 * sign, 9.0 * sign, 0.4 * sign], -1)
+    angvel = np.stack([9.0 * sign, 9.0 * sign, 0.4 * sign - 0.3], -1)
     euler = np.zeros_like(linvel) + np.array([-0.02, 0.1, 3.0])
     m = gait_metrics.speed(trace.replace(linvel=linvel, angvel=angvel, euler=euler), 1.0, DT)
     expected = {
         **{"forward_mean": 2.0, "forward_rmse": 2**0.5, "forward_bias": 1.0},
         **{"forward_std": 0.5, "lateral_std": 0.2, "yaw_rate_std": 0.4},
+        **{"lateral_mean": 0.1, "yaw_rate_mean": -0.3},
         **{"roll_deg": 1.145916, "pitch_deg": 5.729578},
         "forward_mean_ci": 12.7062,  # t of one degree of freedom x sqrt(2) / sqrt(2)
     }
