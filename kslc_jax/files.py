@@ -9,7 +9,11 @@ from kslc_jax.config import ConfigError
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Writes a file at once: whatever happens, `path` holds all of the old or all of the new."""
+    """Writes a file at once: whatever happens, `path` holds all of the old or all of the new.
+
+    A link stays one; what it points to is written.
+    """
+    path = path.resolve()
     part = path.with_name(f".{path.name}.part")
     try:
         part.write_text(text)

@@ -293,6 +293,16 @@ def test_a_disk_that_fills_up_in_the_end_is_named_and_the_old_numbers_stay(tmp_p
     assert json.loads(kept.read_text()) == {"rows": [1]}
 
 
+def test_what_a_link_points_to_is_written(tmp_path):
+    link, target = tmp_path / "latest.json", tmp_path / "there" / "kept.json"
+    target.parent.mkdir()
+    link.symlink_to(target)
+    for rows in ([1], [2]):  # not there yet, and again
+        files.write_json(link, {"rows": rows})
+        assert link.is_symlink() and json.loads(target.read_text()) == {"rows": rows}
+    assert list(target.parent.iterdir()) == [target]
+
+
 class TestPlay:
     @few
     @given(word=words, option=st.sampled_from(["--gait-strip", "--video"]))
