@@ -63,6 +63,19 @@ def test_perturbed():
             assert cell == f"{numbers['survival']:.0%} {numbers['forward_mean']:.2f}"
 
 
+def test_turning_and_side_steps():
+    head, *rows = table("Turning and side steps")
+    turning, sideways = (conditions(name)["nominal"] for name in ("turning", "sideways"))
+    shown = [
+        *((turning, name) for name in ("survival", "forward_mean", "yaw_rate_mean")),
+        *((sideways, name) for name in ("survival", "forward_mean", "lateral_mean")),
+    ]
+    for (_, *cells), (stored, name) in zip(rows, shown, strict=True):
+        assert [float(command) for command in head[1:]] == [n["command"] for n in stored]
+        form = "{:.0%}" if name == "survival" else "{:.2f}"
+        assert cells == [form.format(numbers[name]) for numbers in stored]
+
+
 def test_drake():
     head, *rows = table("A second engine: Drake")
     (stored,) = conditions("drake").values()
