@@ -290,7 +290,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()  # before JAX, whose own choice of what to say the children would inherit
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
+        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.compare")
         if args.keep:
             files.require_writable(args.keep / EVALUATION)
     except ConfigError as error:

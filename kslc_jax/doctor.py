@@ -284,7 +284,13 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
     try:
-        args = tyro.cli(Check | Replay, args=argv, default=Check(), description=__doc__)
+        args = tyro.cli(
+            Check | Replay,
+            args=argv,
+            default=Check(),
+            description=__doc__,
+            prog="python -m kslc_jax.doctor",
+        )
         if isinstance(args, Check):
             return check()
         from kslc_jax.checkpoint import CheckpointError

@@ -170,7 +170,7 @@ def main(argv: list[str] | None = None) -> int:
     from kslc_jax.checkpoint import CheckpointError
 
     try:
-        _report(tyro.cli(Args, args=argv, description=__doc__))
+        _report(tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.evaluate"))
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

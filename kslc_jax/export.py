@@ -294,7 +294,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
+        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.export")
         from kslc_jax.checkpoint import CheckpointError, load_policy, save_policy
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)

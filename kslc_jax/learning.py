@@ -12,7 +12,7 @@ Examples:
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -22,12 +22,18 @@ from kslc_jax.config import ConfigError
 LEARNING = "learning.json"
 """The file's name in a run folder."""
 
+Several = Annotated[
+    tyro.conf.Positional[tuple[Path, ...]],
+    tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="(at least one)"),
+]
+"""Paths on a command line; that there is one is for the command to check."""
+
 
 @dataclass(frozen=True)
 class Args:
     """What to try."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Several
     """Run folders."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
     """Commanded forward speeds [m/s]."""
@@ -90,7 +96,7 @@ def main(argv: list[str] | None = None) -> int:
     from kslc_jax.checkpoint import CheckpointError
 
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
+        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.learning")
         for run in args.runs:
             snapshots(run)
         with Progress(transient=True) as bar:

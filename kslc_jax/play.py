@@ -211,7 +211,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
+        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.play")
         if not args.live:
             from kslc_jax import render  # noqa: F401 (before anything that imports mujoco)
 

@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from kslc_jax.learning import LEARNING
+from kslc_jax.learning import LEARNING, Several
 from kslc_jax.logs import METRICS
 
 Records = dict[str, np.ndarray]
@@ -283,7 +283,7 @@ class Training:
     """When the commanded-speed range grew, and the learning curve over environment steps: speed
     range, tracking, episode length, throughput."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Several
     """Run folders or metrics.jsonl files."""
     out: Path = Path("learning_curve.png")
     """Where the figure goes."""
@@ -293,7 +293,7 @@ class Training:
 class Learning:
     """How each commanded speed was learnt: mean forward speed over environment steps."""
 
-    runs: tyro.conf.Positional[tuple[Path, ...]]
+    runs: Several
     """Run folders in which kslc_jax.learning was run, or learning.json files; METHOD-seedN folders
     are put together by method."""
     out: Path = Path("learning.png")
@@ -304,7 +304,7 @@ class Learning:
 class Performance:
     """Speed, survival and fluctuations over the commanded speed; mean and range over seeds."""
 
-    evaluations: tyro.conf.Positional[tuple[Path, ...]]
+    evaluations: Several
     """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
     out: Path = Path("performance.png")
     """Where the figure goes."""
@@ -314,7 +314,7 @@ class Performance:
 class Momentum:
     """Yaw angular momentum of arms, legs and whole body over the commanded speed."""
 
-    evaluations: tyro.conf.Positional[tuple[Path, ...]]
+    evaluations: Several
     """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
     out: Path = Path("momentum.png")
     """Where the figure goes."""
@@ -346,7 +346,12 @@ def _training(args: Training) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    args = tyro.cli(Training | Learning | Performance | Momentum, args=argv, description=__doc__)
+    args = tyro.cli(
+        Training | Learning | Performance | Momentum,
+        args=argv,
+        description=__doc__,
+        prog="python -m kslc_jax.plots",
+    )
     try:
         draw(args)
     except ValueError as error:

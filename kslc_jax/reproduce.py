@@ -166,7 +166,7 @@ def main(argv: list[str] | None = None) -> int:
     from kslc_jax.run_folder import RunError
 
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
+        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.reproduce")
         if args.train:
             runtime.require_good_jax()
         rows = repeat(args)

@@ -191,7 +191,7 @@ def main(argv: list[str] | None = None) -> int:
     from kslc_jax.checkpoint import CheckpointError
 
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__)
+        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.sim2sim")
         simulator(args.engine)  # what is not installed is told before anything is loaded
         _report(args)
     except (CheckpointError, ConfigError) as error:

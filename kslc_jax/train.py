@@ -121,7 +121,13 @@ def parse(argv: list[str]) -> Args:
         base = run_folder.read_config(known.run_dir)
     else:  # also on resume: the runner names what the stored config has otherwise
         base = config_lib.preset(known.preset or DEFAULT, tuple(known.without))
-    args = tyro.cli(Args, args=argv, default=Args(config=base), description=__doc__)
+    args = tyro.cli(
+        Args,
+        args=argv,
+        default=Args(config=base),
+        description=__doc__,
+        prog="python -m kslc_jax.train",
+    )
     if args.resume and args.start_from:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
     if args.profile < 0:

@@ -293,6 +293,25 @@ def test_a_disk_that_fills_up_in_the_end_is_named_and_the_old_numbers_stay(tmp_p
     assert json.loads(kept.read_text()) == {"rows": [1]}
 
 
+@pytest.mark.parametrize(
+    "module",
+    [compare, doctor, evaluate, export, learning, play, plots, reproduce, sim2sim, train],
+    ids=lambda module: module.__name__,
+)
+def test_usage_is_what_is_typed(module, capsys):
+    with pytest.raises(SystemExit):
+        module.main(["--help"])
+    assert f"usage: python -m {module.__name__} " in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("main", "figure"), [(learning.main, []), (plots.main, ["performance"])])
+def test_at_least_one_path_is_asked_for(main, figure, capsys):
+    with pytest.raises(SystemExit):
+        main([*figure, "--help"])
+    assert " PATH [PATH ...] " in capsys.readouterr().out
+    assert "name at least one" in refused(main, *figure)
+
+
 def test_what_a_link_points_to_is_written(tmp_path):
     link, target = tmp_path / "latest.json", tmp_path / "there" / "kept.json"
     target.parent.mkdir()
