@@ -35,11 +35,13 @@ HEADLINE = (
     ("momentum_yaw_rms", "Lz rms", "{:.2f}"),
 )
 
-BESIDE = (
+ASIDE = (
+    *HEADLINE[:3],
     ("lateral_mean", "mean vy [m/s]", "{:.2f}"),
     ("yaw_rate_mean", "mean yaw rate [rad/s]", "{:.2f}"),
+    *HEADLINE[3:],
 )
-"""What is asked beside a forward speed: side step and turn."""
+"""The same where a side step or a turn is asked for, too: they follow the mean forward speed."""
 
 MOST_SAMPLES = 2_000_000
 """Control steps of all trials whose traces are held in memory at once, about 300 bytes each."""

@@ -8,12 +8,17 @@ from typing import Any
 from kslc_jax.config import ConfigError
 
 
+def _target(path: Path) -> Path:
+    """Where a link leads to, also if nothing is there yet; else the path itself."""
+    return Path(os.path.realpath(path))
+
+
 def write_whole(path: Path, text: str) -> None:
     """Writes a file at once: whatever happens, `path` holds all of the old or all of the new.
 
     A link stays one; what it points to is written.
     """
-    path = path.resolve()
+    path = _target(path)
     part = path.with_name(f".{path.name}.part")
     try:
         part.write_text(text)
@@ -28,10 +33,11 @@ def require_writable(path: Path | None) -> None:
     if path is None:
         return
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = _target(path).parent
+        folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
         raise ConfigError(f"cannot write {path}")
 
 

@@ -222,7 +222,7 @@ def _report(args: Args) -> None:
     columns = evaluate.HEADLINE
     if args.sideways or args.turn:
         title += f", with {args.sideways:g} m/s sideways and {args.turn:g} rad/s"
-        columns = (*columns[:3], *evaluate.BESIDE, *columns[3:])
+        columns = evaluate.ASIDE
     for condition, rows in results.items():
         screen.print(evaluate.table(rows, f"{title}, {condition}", columns))
     if len(results) > 1:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kslc_jax import compare, plots
+from kslc_jax import compare, evaluate, plots
 from kslc_jax.checkpoint import POLICIES
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -32,6 +32,14 @@ def table(section: str) -> list[list[str]]:
     lines = itertools.dropwhile(lambda line: not line.startswith("|"), text.splitlines())
     head, _, *rows = itertools.takewhile(lambda line: line.startswith("|"), lines)
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in (head, *rows)]
+
+
+def assert_column_per_command(head, rows, stored, forms):
+    """A table whose rows are metrics; what a label says before a colon is of the conditions."""
+    assert [float(command) for command in head[1:]] == [n["command"] for n in stored]
+    for label, *cells in rows:
+        name, form = forms[label.split(": ")[-1]]
+        assert cells == [form.format(numbers[name]) for numbers in stored]
 
 
 def conditions(name: str) -> dict:
@@ -65,25 +73,19 @@ def test_perturbed():
 
 def test_turning_and_side_steps():
     head, *rows = table("Turning and side steps")
-    turning, sideways = (conditions(name)["nominal"] for name in ("turning", "sideways"))
-    shown = [
-        *((turning, name) for name in ("survival", "forward_mean", "yaw_rate_mean")),
-        *((sideways, name) for name in ("survival", "forward_mean", "lateral_mean")),
-    ]
-    for (_, *cells), (stored, name) in zip(rows, shown, strict=True):
-        assert [float(command) for command in head[1:]] == [n["command"] for n in stored]
-        form = "{:.0%}" if name == "survival" else "{:.2f}"
-        assert cells == [form.format(numbers[name]) for numbers in stored]
+    forms = {label: (name, form) for name, label, form in evaluate.ASIDE}
+    labels = [label.split(": ")[-1] for label, *_ in rows]
+    assert labels[:3] == ["survived", "mean vx [m/s]", "mean yaw rate [rad/s]"]
+    assert labels[3:] == ["survived", "mean vx [m/s]", "mean vy [m/s]"]
+    for name, part in (("turning", rows[:3]), ("sideways", rows[3:])):
+        assert_column_per_command(head, part, conditions(name)["nominal"], forms)
 
 
 def test_drake():
     head, *rows = table("A second engine: Drake")
     (stored,) = conditions("drake").values()
     stored = [numbers for numbers in stored if numbers["command"] > 0]
-    assert [float(command) for command in head[1:]] == [n["command"] for n in stored]
-    for label, *cells in rows:
-        name, form = FORMS[label]
-        assert cells == [form.format(numbers[name]) for numbers in stored]
+    assert_column_per_command(head, rows, stored, FORMS)
 
 
 def test_compare():
