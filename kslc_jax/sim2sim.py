@@ -37,6 +37,7 @@ PUSH_SECONDS = 4.0
 PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
     "friction": lambda mu: {"friction": (mu, mu), "ground_friction": mu},
     "payload": lambda kg: {"base_mass": (kg, kg)},
+    "com": lambda metres: {"base_com": (metres, metres)},
     "push": lambda speed: {
         "push_seconds": PUSH_SECONDS,
         "push_velocity": speed,
@@ -50,7 +51,7 @@ PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
 
 ALL = (
     *("friction=0.3", "friction=0.6", "friction=1.5"),
-    *("payload=-5", "payload=5", "push=0.5"),
+    *("payload=-5", "payload=5", "com=-0.02", "com=0.02", "push=0.5"),
     *("gains=0.85", "gains=1.15", "strength=0.9", "imu=0.03"),
 )
 """What `--perturb all` runs."""
@@ -80,9 +81,10 @@ class Args:
     latency: bool = False
     """Every action comes one control step late."""
     perturb: tuple[str, ...] = ()
-    """Repeat the sweep with each of these: friction=MU, payload=KG on the base, push=M/S (largest
-    push along x and y, every 4 s), gains=FACTOR on kp and kd, strength=FACTOR on the motors'
-    torque, imu=RAD (constant error of roll and pitch); all: a list of ten."""
+    """Repeat the sweep with each of these: friction=MU, payload=KG on the base, com=M (the base's
+    centre of mass forwards, to the left and up), push=M/S (largest push along x and y, every 4 s),
+    gains=FACTOR on kp and kd, strength=FACTOR on the motors' torque, imu=RAD (constant error of
+    roll and pitch); all: a list of twelve."""
     seed: int = 0
     """Of initial states."""
     json: Path | None = None

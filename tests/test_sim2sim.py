@@ -81,6 +81,7 @@ def test_friction_is_that_of_the_contact(mu):
 
 def test_perturbations_reach_the_robot():
     assert dynamics("payload=-5")[0].base_mass == -5.0
+    np.testing.assert_allclose(dynamics("com=-0.02")[0].base_com, -0.02, rtol=1e-6)
     gains = dynamics("gains=0.85")[0]
     np.testing.assert_allclose(np.r_[gains.kp, gains.kd], 0.85, rtol=1e-6)
     np.testing.assert_allclose(dynamics("strength=0.9")[0].motor_strength, 0.9, rtol=1e-6)
@@ -104,11 +105,11 @@ def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
     assert float(fields["body_mass"].sum()) == pytest.approx(trace.mass[0, 0], abs=1e-4)
 
 
-def test_all_runs_ten_perturbations_after_the_nominal_robot():
+def test_all_runs_twelve_perturbations_after_the_nominal_robot():
     conditions = sim2sim.Args("x", perturb=("all",)).conditions
     more = sim2sim.Args("x", perturb=("all", "friction=0.2", "payload=5")).conditions
-    assert more == (*conditions, "friction=0.2")  # payload=5 is one of the ten
-    assert conditions[0] == "nominal" and len(set(conditions)) == 11
+    assert more == (*conditions, "friction=0.2")  # payload=5 is one of the twelve
+    assert conditions[0] == "nominal" and len(set(conditions)) == 13
 
 
 @pytest.mark.parametrize("name", ["wind=3", "payload", "payload=heavy", "payload=-30", "all=1"])
