@@ -45,7 +45,7 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     history, privileged = (x.reshape(-1, *x.shape[2:]) for x in seen)
     stored = (samples.replace(advantage=advantage), history, privileged)
     learner, losses = _update(config, state, stored, key_update)
-    progress = train_step._progress(traj.outcome)
+    progress = train_step._progress(config, traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
     new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
     return new, train_step._metrics(config, new, traj.outcome, progress, losses)

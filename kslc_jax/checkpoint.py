@@ -2,8 +2,8 @@
 
 A checkpoint holds four orbax items, each usable without the others:
 
-- ``params``  the networks, all that a policy needs;
-- ``core``    optimiser, learning rate, curriculum, key and step;
+- ``params``  the networks, all that a policy needs: the actor as it is used, averaged;
+- ``core``    the actor as it is trained, optimiser, learning rate, curriculum, key and step;
 - ``env``     the environments; with it a resumed run equals an uninterrupted one bit for bit;
 - ``meta``    JSON: schema version, config, metrics of that step, checksums.
 
@@ -29,10 +29,11 @@ import orbax.checkpoint as ocp
 
 from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import networks, observations
+from kslc_jax import networks, observations, ppo
 from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.ppo import Learner
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
@@ -41,12 +42,13 @@ SNAPSHOTS = "snapshots"
 POLICIES = Path(__file__).parent / "policies"
 BEST_METRIC = "score"
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 """Of a checkpoint's items; raise it with every change of the tree of `TrainState`, and say below
 what the older ones lack."""
 
-OLDER_POLICIES = (1,)
-"""Schemas of which only the policy is still read. 1: no ceiling of the learning rate."""
+OLDER_POLICIES = (1, 2)
+"""Schemas of which only the policy is still read. 1: no ceiling of the learning rate. 2: no average
+of the actor, no time of the next command, no sums of the curriculum's top."""
 
 
 class CheckpointError(RuntimeError):
@@ -129,8 +131,9 @@ def _compare(stored: dict[str, int], item: str, found: int) -> None:
 
 def _split(state: TrainState) -> dict[str, Any]:
     return {
-        "params": state.learner.params,
+        "params": deployed(state.learner),
         "core": {
+            "trained": ppo.acting(state.learner.params),
             "opt_state": state.learner.opt_state,
             "learning_rate": state.learner.learning_rate,
             "rate_ceiling": state.learner.rate_ceiling,
@@ -145,7 +148,8 @@ def _split(state: TrainState) -> dict[str, Any]:
 def _join(parts: dict[str, Any], like: TrainState) -> TrainState:
     core = parts["core"]
     learner = like.learner.replace(
-        params=parts["params"],
+        params={**parts["params"], **core["trained"]},
+        average=ppo.acting(parts["params"]),
         opt_state=core["opt_state"],
         learning_rate=core["learning_rate"],
         rate_ceiling=core["rate_ceiling"],
@@ -339,7 +343,12 @@ def load_policy(path_or_name: str | Path) -> Policy:
 
 def policy_of(config: Config, state: TrainState) -> Policy:
     """The policy that a training has got to."""
-    return Policy(config, state.learner.params, state.curriculum, int(state.step))
+    return Policy(config, deployed(state.learner), state.curriculum, int(state.step))
+
+
+def deployed(learner: Learner) -> networks.Params:
+    """The networks as a policy uses them: the actor is the average over the last updates."""
+    return {**learner.params, **learner.average}
 
 
 def save_policy(policy: Policy, folder: Path) -> None:

@@ -21,19 +21,27 @@ class Command:
 
 
 def sample(
-    config: CommandConfig, key: jax.Array, vx_range: tuple[jax.Array, jax.Array], yaw: jax.Array
+    config: CommandConfig,
+    key: jax.Array,
+    vx_range: tuple[jax.Array, jax.Array],
+    yaw: jax.Array,
+    top_width: float = 0.0,
 ) -> Command:
-    """Draws a command for a robot that now heads to `yaw` [rad]; vx is uniform in `vx_range`,
-    for the `slow_fraction` in its part up to `slow_speed`.
+    """Draws a command for a robot that now heads to `yaw` [rad].
 
-    Fast commands come with small side steps and turns: with `narrow_speed` both shrink linearly.
+    vx is uniform in `vx_range` [m/s]; for the `slow_fraction` in its part up to `slow_speed`, for
+    the `top_fraction` in its uppermost `top_width`. Fast commands come with small side steps and
+    turns: with `narrow_speed` both shrink linearly.
     """
     keys = jax.random.split(key, 5)
-    top = vx_range[1]
-    if config.slow_fraction > 0:
-        slow = jax.random.bernoulli(keys[4], config.slow_fraction)
-        top = jnp.where(slow, jnp.clip(config.slow_speed, *vx_range), top)
-    vx = jax.random.uniform(keys[0], minval=vx_range[0], maxval=top)
+    low, high = vx_range
+    if config.slow_fraction + config.top_fraction > 0:
+        part = jax.random.uniform(keys[4])
+        slow = part < config.slow_fraction
+        top = (part >= config.slow_fraction) & (part < config.slow_fraction + config.top_fraction)
+        low = jnp.where(top, jnp.maximum(high - top_width, low), low)
+        high = jnp.where(slow, jnp.clip(config.slow_speed, *vx_range), high)
+    vx = jax.random.uniform(keys[0], minval=low, maxval=high)
     vy = jax.random.uniform(keys[1], minval=config.vy[0], maxval=config.vy[1])
     heading = jax.random.uniform(keys[2], minval=config.heading[0], maxval=config.heading[1])
     if config.narrow_speed > 0:
@@ -49,6 +57,15 @@ def sample(
     heading = jnp.where(forward, yaw, heading)
     velocity = jnp.stack([vx, vy, jnp.zeros(())])
     return steer(config, Command(velocity, heading, jnp.zeros((), bool)), yaw)
+
+
+def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> jax.Array:
+    """Control steps [] that a new command holds for."""
+    longest = round(config.resample_seconds / control_dt)
+    if config.shortest_seconds == 0:
+        return jnp.asarray(longest)
+    shortest = round(config.shortest_seconds / control_dt)
+    return jax.random.randint(key, (), shortest, longest + 1)
 
 
 def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:

@@ -4,6 +4,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
+from kslc_jax import maths
 from kslc_jax.config import Config, CurriculumConfig
 
 
@@ -17,6 +18,10 @@ class Curriculum:
     fast_tracking: jax.Array  # [] the same over the commands in the top part of the range
     episode_steps: jax.Array  # [] moving average length of finished episodes
     gait: jax.Array  # [] moving average of how well feet follow the clock at speed, -0.3 to 1
+    top_speed: jax.Array  # [] m/s, fading sum of vx over the settled commands at the top
+    top_commanded: jax.Array  # [] m/s, the same of the commanded vx
+    top_falls: jax.Array  # [] fading sum of the falls under commands at the top
+    top_minutes: jax.Array  # [] the same of the time that robots had such commands
     updates: jax.Array  # [] int, updates since the last change
 
 
@@ -31,6 +36,10 @@ class Progress:
     episode_steps: jax.Array  # [] mean length of the episodes that ended; see train_step.init
     episode_count: jax.Array  # [] number of those
     gait: jax.Array  # [] mean of the feet_contact_number term over the fast commands' samples
+    top_speed: jax.Array  # [] m/s, sum of vx over the settled commands at the top of the range
+    top_commanded: jax.Array  # [] m/s, sum of their commanded vx
+    top_falls: jax.Array  # [] falls under commands at the top
+    top_minutes: jax.Array  # [] minutes that robots had such commands, all robots together
 
 
 def init(config: Config) -> Curriculum:
@@ -42,6 +51,10 @@ def init(config: Config) -> Curriculum:
         fast_tracking=jnp.zeros(()),
         episode_steps=jnp.zeros(()),
         gait=jnp.zeros(()),
+        top_speed=jnp.zeros(()),
+        top_commanded=jnp.zeros(()),
+        top_falls=jnp.zeros(()),
+        top_minutes=jnp.zeros(()),
         updates=jnp.zeros((), jnp.int32),
     )
 
@@ -60,6 +73,23 @@ def is_fast(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.A
     return vx > config.fast_share * state.v_max
 
 
+def is_top(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.Array:
+    """True where the commanded vx [m/s] lies within one `v_step` of the range's end."""
+    return vx > state.v_max - config.v_step
+
+
+def top_error(state: Curriculum) -> jax.Array:
+    """Relative error [] of the mean speed under commands at the top of the range; 1 before any."""
+    known = state.top_commanded > 0.0
+    commanded = jnp.where(known, state.top_commanded, 1.0)
+    return jnp.where(known, jnp.abs(state.top_speed / commanded - 1.0), 1.0)
+
+
+def top_falls(state: Curriculum) -> jax.Array:
+    """Falls per minute [] under commands at the top of the range."""
+    return state.top_falls / jnp.maximum(state.top_minutes, 1e-6)
+
+
 def left(config: CurriculumConfig, state: Curriculum) -> jax.Array:
     """Share [] of the way from `v_start` to `v_limit` that is still ahead; 1 if there is none."""
     way = config.v_limit - config.v_start
@@ -69,38 +99,57 @@ def left(config: CurriculumConfig, state: Curriculum) -> jax.Array:
 def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> Curriculum:
     """Averages `progress` in and, where the gate opens, widens the range and shortens the cycle.
 
-    The gate: all and fast tracking above their thresholds, long episodes, feet that follow the
-    clock, some updates since the last change. A widened range starts with empty averages of the
-    fast commands.
+    The gate asks for enough of each: tracking under all and under fast commands, length of the
+    episodes, feet that follow the clock, updates since the last change; and for a mean speed and
+    few falls under the commands at the top of the range, which a mean over all commands hides.
+    A widened range starts with empty averages of the fast commands.
     """
-
-    def average(old: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array:
-        mixed = config.smoothing * old + (1.0 - config.smoothing) * new
-        return jnp.where(count > 0, mixed, old)
-
-    tracking = average(state.tracking, progress.tracking, progress.tracking_count)
-    fast = average(state.fast_tracking, progress.fast_tracking, progress.fast_count)
-    steps = average(state.episode_steps, progress.episode_steps, progress.episode_count)
-    gait = average(state.gait, progress.gait, progress.fast_count)
-    updates = state.updates + 1
+    state = _averaged(config, state, progress)
     v_max = jnp.minimum(state.v_max + config.v_step, config.v_limit)
     cycle = jnp.maximum(state.cycle_time * config.cycle_factor, config.cycle_min)
     v_max = v_max if config.velocity else state.v_max
     cycle = cycle if config.cycle else state.cycle_time
     gate = (
-        (tracking >= config.threshold)
-        & (fast >= config.fast_threshold)
-        & (steps >= config.min_episode_steps)
-        & (gait >= config.gait_threshold)
-        & (updates >= config.min_updates)
+        (state.tracking >= config.threshold)
+        & (state.fast_tracking >= config.fast_threshold)
+        & (state.episode_steps >= config.min_episode_steps)
+        & (state.gait >= config.gait_threshold)
+        & (top_error(state) <= config.top_error)
+        & (top_falls(state) <= config.top_falls)
+        & (state.updates >= config.min_updates)
         & ((v_max > state.v_max) | (cycle < state.cycle_time))
     )
-    return Curriculum(
-        v_max=jnp.where(gate, v_max, state.v_max),
-        cycle_time=jnp.where(gate, cycle, state.cycle_time),
-        tracking=tracking,
-        fast_tracking=jnp.where(gate, 0.0, fast),
-        episode_steps=steps,
-        gait=jnp.where(gate, 0.0, gait),
-        updates=jnp.where(gate, 0, updates),
+    zero = jnp.zeros(())
+    wider = state.replace(
+        v_max=v_max,
+        cycle_time=cycle,
+        fast_tracking=zero,
+        gait=zero,
+        top_speed=zero,
+        top_commanded=zero,
+        top_falls=zero,
+        top_minutes=zero,
+        updates=jnp.zeros((), jnp.int32),
+    )
+    return maths.tree_where(gate, wider, state)
+
+
+def _averaged(config: CurriculumConfig, state: Curriculum, progress: Progress) -> Curriculum:
+    """The curriculum one update later, with the moving averages and fading sums of `progress`."""
+
+    def average(old: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array:
+        mixed = config.smoothing * old + (1.0 - config.smoothing) * new
+        return jnp.where(count > 0, mixed, old)
+
+    fast_count = progress.fast_count
+    return state.replace(
+        tracking=average(state.tracking, progress.tracking, progress.tracking_count),
+        fast_tracking=average(state.fast_tracking, progress.fast_tracking, fast_count),
+        episode_steps=average(state.episode_steps, progress.episode_steps, progress.episode_count),
+        gait=average(state.gait, progress.gait, fast_count),
+        top_speed=config.smoothing * state.top_speed + progress.top_speed,
+        top_commanded=config.smoothing * state.top_commanded + progress.top_commanded,
+        top_falls=config.smoothing * state.top_falls + progress.top_falls,
+        top_minutes=config.smoothing * state.top_minutes + progress.top_minutes,
+        updates=state.updates + 1,
     )

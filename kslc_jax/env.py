@@ -32,6 +32,8 @@ class EnvState:
     dynamics: Dynamics
     gait: GaitState
     command: Command
+    command_since: jax.Array  # [] int, `time` when the command was drawn
+    command_until: jax.Array  # [] int, `time` when the next one will be
     history: jax.Array  # [K, 59] actor frames, oldest first
     privileged_history: jax.Array  # [Kp, 89] critic frames
     last_action: jax.Array  # [16] as applied
@@ -52,13 +54,16 @@ class Outcome:
     terms: dict[str, jax.Array]  # raw reward terms, see rewards.TERMS
     settled: jax.Array  # [] bool: the command has been the same for a while
     fast: jax.Array  # [] bool: and it was in the top part of the range
+    top: jax.Array  # [] bool: the command lies within one `v_step` of the range's end
+    commanded: jax.Array  # [] m/s, commanded vx
+    speed: jax.Array  # [] m/s, vx of the base, base frame
     episode_steps: jax.Array  # [] int, length of the episode so far; see train_step.init
     speeding: jax.Array  # [] bool: some joint is at its speed limit, or over it
 
 
 def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     """A fresh episode."""
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 6)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
     joints = jax.random.uniform(keys[0], (NUM_JOINTS,), minval=-noise, maxval=noise)
@@ -71,6 +76,8 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         dynamics=randomize.sample(config.randomize, keys[2]),
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
+        command_since=jnp.zeros((), jnp.int32),
+        command_until=commands.holding_steps(config.command, keys[5], config.control_dt),
         history=jnp.zeros((config.env.frames, observations.ACTOR_WIDTH)),
         privileged_history=jnp.zeros((config.env.privileged_frames, observations.CRITIC_WIDTH)),
         last_action=jnp.zeros(NUM_JOINTS),
@@ -117,7 +124,7 @@ def step(
     now = signals.read(robot, new)
 
     command = commands.steer(config.command, state.command, now.base_euler[2])
-    cycle = gait.cycle_time(config.gait, command, curriculum.cycle_time, curriculum.v_max)
+    cycle = gait.cycle_time(config, command, curriculum.cycle_time, curriculum.v_max)
     gait_now = gait.update(config.gait, state.gait, now, command, cycle, config.control_dt)
 
     outcome = _outcome(config, state, action, now, gait_now, command, broken, curriculum)
@@ -125,12 +132,13 @@ def step(
     state = state.replace(
         physics=new,
         gait=gait_now,
-        command=_resample(config, command, time, keys[1], curriculum, now),
+        command=command,
         last_action=action,
         last_last_action=state.last_action,
         last_base_velocity=now.base_velocity,
         time=time,
     )
+    state = _resample(config, state, keys[1], curriculum, now)
     state = _push(config, state, keys[2])
     state = _observe(config, state, signals.read(robot, state.physics), keys[3])
     fresh = reset(config, keys[4], curriculum)
@@ -169,7 +177,9 @@ def _outcome(
             v_max=curriculum.v_max,
         ),
     )
-    settled = _command_age(config, before.time) >= config.curriculum.settle_seconds
+    held = (before.time - before.command_since) * config.control_dt
+    settled = held >= config.curriculum.settle_seconds
+    vx = command.velocity[0]
     return Outcome(
         reward=jnp.where(broken, 0.0, reward),
         terminated=terminated,
@@ -177,7 +187,10 @@ def _outcome(
         broken=broken,
         terms=terms,
         settled=settled,
-        fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, command.velocity[0]),
+        fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, vx),
+        top=curriculum_lib.is_top(config.curriculum, curriculum, vx),
+        commanded=vx,
+        speed=now.base_linvel[0],
         episode_steps=time,
         speeding=jnp.any(jnp.abs(now.joint_vel) >= robot.speed_limit),
     )
@@ -203,26 +216,22 @@ def _sample_command(
     config: Config, key: jax.Array, curriculum: Curriculum, now: Signals
 ) -> Command:
     vx_range = (jnp.asarray(config.curriculum.v_min), curriculum.v_max)
-    return commands.sample(config.command, key, vx_range, now.base_euler[2])
+    top_width = config.curriculum.v_step
+    return commands.sample(config.command, key, vx_range, now.base_euler[2], top_width)
 
 
 def _resample(
-    config: Config,
-    command: Command,
-    time: jax.Array,
-    key: jax.Array,
-    curriculum: Curriculum,
-    now: Signals,
-) -> Command:
-    """A new command every `resample_seconds` of the episode."""
-    fresh = _sample_command(config, key, curriculum, now)
-    return maths.tree_where(_command_age(config, time) == 0.0, fresh, command)
-
-
-def _command_age(config: Config, time: jax.Array) -> jax.Array:
-    """Seconds since the last command was drawn, at `time` control steps of the episode."""
-    period = round(config.command.resample_seconds / config.control_dt)
-    return (time % period) * config.control_dt
+    config: Config, state: EnvState, key: jax.Array, curriculum: Curriculum, now: Signals
+) -> EnvState:
+    """Draws a new command where the old one's time is over."""
+    key_command, key_time = jax.random.split(key)
+    fresh = state.replace(
+        command=_sample_command(config, key_command, curriculum, now),
+        command_since=state.time,
+        command_until=state.time
+        + commands.holding_steps(config.command, key_time, config.control_dt),
+    )
+    return maths.tree_where(state.time >= state.command_until, fresh, state)
 
 
 def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax.commands import Command, speed_share
-from kslc_jax.config import GaitConfig
+from kslc_jax.config import Config, GaitConfig
 from kslc_jax.robot import Robot
 from kslc_jax.signals import Signals
 
@@ -107,12 +107,21 @@ def _share_of_full_speed(config: GaitConfig, command: Command) -> jax.Array:
     return jnp.clip(jnp.abs(command.velocity[0]) / config.full_speed, 0.0, 1.0)
 
 
-def cycle_time(config: GaitConfig, command: Command, curriculum_cycle, v_max) -> jax.Array:
-    """Seconds per cycle for this command under the curriculum's cycle time and v_max."""
-    if not config.cycle_follows_speed:
-        return curriculum_cycle
-    share = speed_share(command, v_max)
-    return config.cycle_time + share * (curriculum_cycle - config.cycle_time)
+def cycle_time(config: Config, command: Command, curriculum_cycle, v_max) -> jax.Array:
+    """Seconds per cycle [] for this command under the curriculum's cycle time [s] and v_max [m/s].
+
+    With `cycle_from_speed` it is what the curriculum's cycle was (Eq. 10) when the command's speed
+    was the top of the range. No command's clock changes then when the range grows.
+    """
+    gait = config.gait
+    if gait.cycle_from_speed > 0:
+        beyond = jnp.maximum(jnp.abs(command.velocity[0]) - gait.cycle_from_speed, 0.0)
+        factor = config.curriculum.cycle_factor ** (beyond / config.curriculum.v_step)
+        return jnp.maximum(gait.cycle_time * factor, curriculum_cycle)
+    if gait.cycle_follows_speed:
+        share = speed_share(command, v_max)
+        return gait.cycle_time + share * (curriculum_cycle - gait.cycle_time)
+    return curriculum_cycle
 
 
 def reference_pose(
@@ -135,8 +144,9 @@ def reference_pose(
     hips = _pattern(robot, "left", _HIP) + _pattern(robot, "right", _HIP)
     arms = _pattern(robot, "left", _ARM) + _pattern(robot, "right", _ARM)
     elbows = _pattern(robot, "left", _ELBOW) - _pattern(robot, "right", _ELBOW)
-    sweep = c * (config.arm_swing * arms - config.stride_sweep * hips)
-    return pose + share * (sweep + config.elbow_bend * elbows)
+    swing_of_arms = config.arm_swing_slow + share * (config.arm_swing - config.arm_swing_slow)
+    sweep = c * (swing_of_arms * arms - share * config.stride_sweep * hips)
+    return pose + sweep + share * config.elbow_bend * elbows
 
 
 def _pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:

@@ -14,7 +14,14 @@ from kslc_jax import robot as robot_lib
 from kslc_jax.config import NUM_JOINTS, Config
 
 Params = dict[str, Any]
-"""{'actor': flax params, 'critic': flax params, 'log_std': [16]}"""
+"""{'actor': flax params, 'critic': flax params, 'log_std': [16]}, and 'estimator' where the config
+has one."""
+
+ACTING = ("actor", "estimator", "log_std")
+"""What of the parameters a policy acts with; the critic is there for training only."""
+
+ESTIMATED = 3
+"""Numbers that an estimator gives: the base's velocity, base frame, scaled as for the critic."""
 
 _LOG_2PI = 1.8378770664093453
 _HALF = 0.5**0.5
@@ -29,8 +36,9 @@ class MLP(nn.Module):
     out_scale: float
 
     @nn.compact
-    def __call__(self, frames: jax.Array) -> jax.Array:
-        x = _flat(frames)
+    def __call__(self, frames: jax.Array, *beside: jax.Array) -> jax.Array:
+        """Outputs [..., O] for frames [..., K, W] and what the actor reads beside them [..., V]."""
+        x = jnp.concatenate([_flat(frames), *beside], axis=-1)
         for size in self.hidden:
             x = nn.elu(nn.Dense(size)(x))
         return nn.Dense(self.outputs, kernel_init=_kernel_init(self.out_scale))(x)
@@ -70,10 +78,15 @@ class MirrorMLP(nn.Module):
     inputs: Parity
     outputs: Parity
     out_scale: float
+    beside: tuple[Parity, ...] = ()
 
     @nn.compact
-    def __call__(self, frames: jax.Array) -> jax.Array:
+    def __call__(self, frames: jax.Array, *beside: jax.Array) -> jax.Array:
+        """Outputs [..., O] for frames [..., K, W] and what the actor reads beside them [..., V]."""
         even, odd = _flat(frames @ self.inputs.even), _flat(frames @ self.inputs.odd)
+        for extra, basis in zip(beside, self.beside, strict=True):
+            even = jnp.concatenate([even, extra @ basis.even], axis=-1)
+            odd = jnp.concatenate([odd, extra @ basis.odd], axis=-1)
         for size in self.hidden:
             even, odd = nn.Dense(size // 2)(even), nn.Dense(size // 2, use_bias=False)(odd)
             left, right = nn.elu((even + odd) * _HALF), nn.elu((even - odd) * _HALF)
@@ -127,8 +140,26 @@ def _actor(config: Config) -> nn.Module:
     scale = config.network.init_mean
     if not config.network.symmetric:
         return MLP(config.network.actor, NUM_JOINTS, scale)
+    inputs, outputs = parity(*observations.mirror_map(observations.ACTOR)), mirrored_joints()
+    beside = (mirrored_velocity(),) if config.network.estimator else ()
+    return MirrorMLP(config.network.actor, inputs, outputs, scale, beside)
+
+
+def _estimator(config: Config) -> nn.Module:
+    if not config.network.symmetric:
+        return MLP(config.network.estimator, ESTIMATED, 1.0)
     inputs = parity(*observations.mirror_map(observations.ACTOR))
-    return MirrorMLP(config.network.actor, inputs, parity(*robot_lib.mirror_joints()), scale)
+    return MirrorMLP(config.network.estimator, inputs, mirrored_velocity(), 1.0)
+
+
+def mirrored_joints() -> Parity:
+    """Bases for the joint vector [16]."""
+    return parity(*robot_lib.mirror_joints())
+
+
+def mirrored_velocity() -> Parity:
+    """Bases for a velocity [3] in the base frame."""
+    return parity(np.arange(ESTIMATED), np.array(observations.POLAR))
 
 
 def _critic(config: Config) -> nn.Module:
@@ -141,19 +172,37 @@ def _critic(config: Config) -> nn.Module:
 def init(config: Config, key: jax.Array) -> Params:
     """Fresh parameters."""
     key_actor, key_critic = jax.random.split(key)
+    beside = (jnp.zeros(ESTIMATED),) if config.network.estimator else ()
     history = jnp.zeros((config.env.frames, observations.ACTOR_WIDTH))
     privileged = jnp.zeros((config.env.privileged_frames, observations.CRITIC_WIDTH))
-    return {
-        "actor": _actor(config).init(key_actor, history)["params"],
+    params = {
+        "actor": _actor(config).init(key_actor, history, *beside)["params"],
         "critic": _critic(config).init(key_critic, privileged)["params"],
         "log_std": jnp.full(NUM_JOINTS, jnp.log(config.network.init_std), jnp.float32),
     }
+    if config.network.estimator:
+        key_estimator = jax.random.fold_in(key_actor, 1)
+        params["estimator"] = _estimator(config).init(key_estimator, history)["params"]
+    return params
 
 
 def policy(config: Config, params: Params, history: jax.Array) -> Gaussian:
     """Action distribution for actor histories [..., K, 59]."""
-    mean = cast(jax.Array, _actor(config).apply({"params": params["actor"]}, history))
-    return Gaussian(mean, log_std(config, params))
+    return policy_and_estimate(config, params, history)[0]
+
+
+def policy_and_estimate(
+    config: Config, params: Params, history: jax.Array
+) -> tuple[Gaussian, jax.Array | None]:
+    """The same, and the estimated base velocity [..., 3] as in the critic's frame; None without an
+    estimator. The actor's loss does not train the estimator."""
+    estimate, beside = None, ()
+    if config.network.estimator:
+        variables = {"params": params["estimator"]}
+        estimate = cast(jax.Array, _estimator(config).apply(variables, history))
+        beside = (jax.lax.stop_gradient(estimate),)
+    mean = cast(jax.Array, _actor(config).apply({"params": params["actor"]}, history, *beside))
+    return Gaussian(mean, log_std(config, params)), estimate
 
 
 def log_std(config: Config, params: Params) -> jax.Array:

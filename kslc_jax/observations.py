@@ -24,7 +24,8 @@ Mirror = Literal["negate", "keep", "joints", "swap", "polar", "axial", "command"
 
 # Signs under mirroring in the sagittal plane: polar vectors (velocities) flip y, axial ones (rates,
 # roll-pitch-yaw) flip x and z. Commands are (vx, vy, yaw rate).
-_SIGNS = {"polar": (1, -1, 1), "axial": (-1, 1, -1), "command": (1, -1, -1)}
+POLAR = (1, -1, 1)
+_SIGNS = {"polar": POLAR, "axial": (-1, 1, -1), "command": (1, -1, -1)}
 
 MASS_SCALE = 30.0
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 
 from kslc_jax.config import PPOConfig
-from kslc_jax.networks import Gaussian, Params
+from kslc_jax.networks import ACTING, Gaussian, Params
 
 
 @flax.struct.dataclass
@@ -17,6 +17,7 @@ class Learner:
     """Everything an update changes."""
 
     params: Params
+    average: Params  # of the parameters that the policy acts with, see PPOConfig.average
     opt_state: optax.OptState
     learning_rate: jax.Array  # []
     rate_ceiling: jax.Array  # [] what the learning rate may reach; lowered after bad numbers
@@ -47,8 +48,9 @@ class Drawn:
 RELIEF = 1.02
 """Factor on the ceiling of the learning rate per update: a halved one is whole after 36."""
 
-Apply = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array]]
-"""(params, indices [B]) -> (action distribution, values [B]) at those observations."""
+Apply = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array, jax.Array]]
+"""(params, indices [B]) -> (action distribution, values [B], squared error of the estimated
+velocity [B], zero without an estimator) at those observations."""
 
 
 def optimizer(config: PPOConfig) -> optax.GradientTransformation:
@@ -60,7 +62,12 @@ def init(config: PPOConfig, params: Params) -> Learner:
     """Learner before the first update."""
     rate = jnp.asarray(config.learning_rate, jnp.float32)
     ceiling = jnp.asarray(config.learning_rate_bounds[1], jnp.float32)
-    return Learner(params, optimizer(config).init(params), rate, ceiling)
+    return Learner(params, acting(params), optimizer(config).init(params), rate, ceiling)
+
+
+def acting(params: Params) -> Params:
+    """The part of the parameters that a policy acts with."""
+    return {name: params[name] for name in ACTING if name in params}
 
 
 def gae(
@@ -106,8 +113,9 @@ def gae(
 def loss(
     config: PPOConfig, apply: Apply, drawn: Drawn, params: Params, batch: Samples
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate + clipped value loss - entropy bonus, over the valid samples of `batch`."""
-    dist, value = apply(params, batch.index)
+    """Clipped surrogate + clipped value loss - entropy bonus + error of the velocity estimate, over
+    the valid samples of `batch`."""
+    dist, value, estimate_error = apply(params, batch.index)
     weight = batch.valid / jnp.maximum(jnp.sum(batch.valid), 1)
 
     def mean(x: jax.Array) -> jax.Array:
@@ -121,11 +129,13 @@ def loss(
     errors = jnp.maximum(jnp.square(value - batch.target), jnp.square(near - batch.target))
     value_loss = mean(errors)
 
-    entropy = dist.entropy()
+    entropy, estimate_loss = dist.entropy(), mean(estimate_error)
     total = policy_loss + config.value_coef * value_loss - drawn.entropy_coef * entropy
+    total += config.estimate_coef * estimate_loss
     info = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
+        "estimate_loss": estimate_loss,
         "entropy": entropy,
         "kl": mean(dist.kl_from(Gaussian(batch.mean, drawn.log_std))),
         "clip_share": mean(jnp.abs(ratio - 1.0) > config.clip),
@@ -157,7 +167,7 @@ def gradient_step(
     updates, opt_state = optimizer(config).update(grads, learner.opt_state)
     params = jax.tree.map(lambda p, u: p - rate * u, learner.params, updates)
     finite = jnp.isfinite(grad_norm)
-    new = Learner(params, opt_state, rate, ceiling)
+    new = learner.replace(params=params, opt_state=opt_state, learning_rate=rate)
     learner = jax.tree.map(lambda a, b: jnp.where(finite, a, b), new, learner)
     return learner, {**info, "grad_norm": grad_norm, "skipped": 1.0 - finite}
 
@@ -185,7 +195,14 @@ def update(
         return jax.lax.scan(minibatch, learner, rows)
 
     learner, info = jax.lax.scan(epoch, learner, jax.random.split(key, config.epochs))
-    return learner, jax.tree.map(jnp.mean, info)
+    average = averaged(config, learner.average, acting(learner.params))
+    return learner.replace(average=average), jax.tree.map(jnp.mean, info)
+
+
+def averaged(config: PPOConfig, average: Params, newest: Params) -> Params:
+    """The exponential average one update later."""
+    keep = config.average
+    return jax.tree.map(lambda a, b: keep * a + (1.0 - keep) * b, average, newest)
 
 
 def _normalise(advantage: jax.Array, valid: jax.Array) -> jax.Array:

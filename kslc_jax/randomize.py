@@ -7,6 +7,9 @@ import jax.numpy as jnp
 from kslc_jax.config import NUM_JOINTS, RandomizeConfig, Range
 from kslc_jax.robot import Robot
 
+LINKS = NUM_JOINTS + 1
+"""The base, and the link after each joint."""
+
 
 @flax.struct.dataclass
 class Dynamics:
@@ -19,6 +22,9 @@ class Dynamics:
     kd: jax.Array  # [16] factor on the velocity gain
     motor_strength: jax.Array  # [16] factor on the available torque
     joint_friction: jax.Array  # [16] N m
+    link_mass: jax.Array  # [17] factor on mass and inertia: the base, then each joint's link
+    link_com: jax.Array  # [17, 3] m, shift of the centre of mass, link frame
+    hand_mass: jax.Array  # [] kg added to each arm's last link
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
 
 
@@ -32,13 +38,16 @@ def nominal(friction: float = 1.0) -> Dynamics:
         kd=jnp.ones(NUM_JOINTS),
         motor_strength=jnp.ones(NUM_JOINTS),
         joint_friction=jnp.zeros(NUM_JOINTS),
+        link_mass=jnp.ones(LINKS),
+        link_com=jnp.zeros((LINKS, 3)),
+        hand_mass=jnp.zeros(()),
         noise=jnp.ones(()),
     )
 
 
 def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
     """Draws the parameters of one episode, each uniform in its configured range."""
-    keys = jax.random.split(key, 8)
+    keys = jax.random.split(key, 11)
 
     def uniform(key: jax.Array, bounds: Range, shape: tuple[int, ...] = ()) -> jax.Array:
         return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
@@ -51,6 +60,9 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
         kd=uniform(keys[4], config.kd, (NUM_JOINTS,)),
         motor_strength=uniform(keys[5], config.motor_strength, (NUM_JOINTS,)),
         joint_friction=uniform(keys[6], config.joint_friction, (NUM_JOINTS,)),
+        link_mass=uniform(keys[8], config.link_mass, (LINKS,)),
+        link_com=uniform(keys[9], config.link_com, (LINKS, 3)),
+        hand_mass=uniform(keys[10], config.hand_mass),
         noise=uniform(keys[7], config.noise),
     )
 
@@ -58,22 +70,24 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
 def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> dict[str, jax.Array]:
     """The mjModel fields that `dynamics` changes, by name; both engines take them as they are.
 
-    Friction is the mean of foot and ground, PhysX's rule (MuJoCo would take the larger); the base's
+    Friction is the mean of foot and ground, PhysX's rule (MuJoCo would take the larger); a link's
     inertia scales with its mass. Derived constants other than the subtree masses keep their nominal
     values in both engines: they only scale the contact regularisation.
     """
-    model, base = robot.mj_model, robot.base_body_id
+    model, base, links = robot.mj_model, robot.base_body_id, robot.link_body_ids
     contact_friction = 0.5 * (dynamics.friction + ground_friction)
-    mass = model.body_mass[base] + dynamics.base_mass
-    subtree = jnp.asarray(model.body_subtreemass)
+    nominal_mass = jnp.asarray(model.body_mass)
+    mass = nominal_mass.at[links].multiply(dynamics.link_mass)
+    mass = mass.at[base].add(dynamics.base_mass)
+    mass = mass.at[robot.hand_body_ids].add(dynamics.hand_mass)
+    com = jnp.asarray(model.body_ipos).at[links].add(dynamics.link_com)
+    scale = mass[1:] / nominal_mass[1:]  # the world weighs nothing
     return {
         "geom_friction": jnp.asarray(model.geom_friction)
         .at[robot.foot_geom_ids, 0]
         .set(contact_friction),
-        "body_mass": jnp.asarray(model.body_mass).at[base].set(mass),
-        "body_inertia": jnp.asarray(model.body_inertia)
-        .at[base]
-        .multiply(mass / model.body_mass[base]),
-        "body_ipos": jnp.asarray(model.body_ipos).at[base].add(dynamics.base_com),
-        "body_subtreemass": subtree.at[: base + 1].add(dynamics.base_mass),
+        "body_mass": mass,
+        "body_inertia": jnp.asarray(model.body_inertia).at[1:].multiply(scale[:, None]),
+        "body_ipos": com.at[base].add(dynamics.base_com),
+        "body_subtreemass": jnp.sum(robot.subtree * mass, axis=1),
     }

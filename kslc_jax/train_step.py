@@ -13,12 +13,15 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import env, maths, networks, ppo
+from kslc_jax import env, maths, networks, observations, ppo
 from kslc_jax.config import Config, RunConfig
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Gaussian, Params
 from kslc_jax.ppo import Drawn, Learner, Samples
+
+_VELOCITY = observations.slices(observations.CRITIC)["base_linvel"]
+"""Where the critic's frame has what an estimator learns."""
 
 Metrics = dict[str, jax.Array]
 Spread = Callable[[jax.Array], jax.Array]
@@ -77,7 +80,7 @@ def init(config: Config, seed: int | jax.Array) -> TrainState:
     times = jax.random.randint(key_time, (config.env.num_envs,), 0, config.episode_steps)
     return TrainState(
         learner=ppo.init(config.ppo, networks.init(config, key_params)),
-        env=envs.replace(time=times),
+        env=envs.replace(time=times, command_since=times, command_until=times + envs.command_until),
         curriculum=curriculum,
         key=key,
         step=jnp.zeros((), jnp.int32),
@@ -92,7 +95,9 @@ def start_from(
     if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, state.learner.params):
         raise ValueError("networks of other shapes")
     # Copies, for a train step donates its state and another training may start from the same.
-    learner = state.learner.replace(params=jax.tree.map(jnp.copy, params))
+    params = jax.tree.map(jnp.copy, params)
+    average = jax.tree.map(jnp.copy, ppo.acting(params))
+    learner = state.learner.replace(params=params, average=average)
     curriculum = curriculum_lib.taken_over(config, curriculum)
     curriculum = jax.tree.map(lambda x, like: x.astype(like.dtype), curriculum, state.curriculum)
     return state.replace(learner=learner, curriculum=curriculum)
@@ -113,7 +118,7 @@ def step(
     learner, losses = ppo.update(
         config.ppo, apply, drawn(config, state), state.learner, samples, key_update
     )
-    progress = _progress(traj.outcome)
+    progress = _progress(config, traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
     new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
     return new, _metrics(config, new, traj.outcome, progress, losses)
@@ -233,10 +238,14 @@ def _observer(
     actor = _windows(start.history, traj.frame, traj.age)
     critic = _windows(start.privileged_history, traj.privileged, traj.age)
 
-    def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array]:
+    def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array, jax.Array]:
         index = spread(index)
-        dist = networks.policy(config, params, actor(index))
-        return dist, networks.value(config, params, critic(index))
+        dist, estimate = networks.policy_and_estimate(config, params, actor(index))
+        seen = critic(index)
+        error = jnp.zeros(index.shape)
+        if estimate is not None:
+            error = jnp.sum(jnp.square(estimate - seen[:, -1, _VELOCITY]), axis=-1)
+        return dist, networks.value(config, params, seen), error
 
     return apply
 
@@ -263,7 +272,7 @@ def _windows(
     return gather
 
 
-def _progress(out: Outcome) -> Progress:
+def _progress(config: Config, out: Outcome) -> Progress:
     """What the rollout says about the policy, for the curriculum; broken steps say nothing."""
     done = out.terminated | out.truncated
 
@@ -277,8 +286,19 @@ def _progress(out: Outcome) -> Progress:
     fast_tracking, fast_count = mean_over(reached, out.fast)
     episode_steps, episode_count = mean_over(out.episode_steps, done)
     gait, _ = mean_over(out.terms["feet_contact_number"], out.fast)
+    top = out.top & ~out.broken
     return Progress(
-        tracking, tracking_count, fast_tracking, fast_count, episode_steps, episode_count, gait
+        tracking=tracking,
+        tracking_count=tracking_count,
+        fast_tracking=fast_tracking,
+        fast_count=fast_count,
+        episode_steps=episode_steps,
+        episode_count=episode_count,
+        gait=gait,
+        top_speed=jnp.sum(out.speed * (top & out.settled)),
+        top_commanded=jnp.sum(out.commanded * (top & out.settled)),
+        top_falls=jnp.sum(out.terminated & top),
+        top_minutes=jnp.sum(top) * (config.control_dt / 60.0),
     )
 
 
@@ -303,6 +323,8 @@ def _metrics(
         "curriculum/tracking": state.curriculum.tracking,
         "curriculum/fast_tracking": state.curriculum.fast_tracking,
         "curriculum/gait": state.curriculum.gait,
+        "curriculum/top_error": curriculum_lib.top_error(state.curriculum),
+        "curriculum/top_falls": curriculum_lib.top_falls(state.curriculum),
         "ppo/learning_rate": state.learner.learning_rate,
         "ppo/std": jnp.mean(jnp.exp(networks.log_std(config, state.learner.params))),
         **{f"ppo/{name}": value for name, value in losses.items()},

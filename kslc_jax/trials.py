@@ -78,7 +78,7 @@ def trial_config(config: Config, setting: Setting, count: int) -> Config:
         physics=setting.physics,
         randomize=setting.randomize,
         env=dataclasses.replace(config.env, num_envs=count, episode_seconds=FOREVER, **quiet),
-        command=dataclasses.replace(config.command, resample_seconds=FOREVER),
+        command=dataclasses.replace(config.command, resample_seconds=FOREVER, shortest_seconds=0.0),
         ppo=dataclasses.replace(config.ppo, minibatches=1),
     )
 

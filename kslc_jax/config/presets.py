@@ -50,11 +50,14 @@ _LAPTOP_LEARNER: dict[str, Any] = {
 
 _LAPTOP = _override(
     _override(_PAPER, **_LAPTOP_LEARNER),
-    ppo={"entropy_fades": True},
+    network={"estimator": (128, 64)},
+    ppo={"entropy_fades": True, "average": 0.98},
     command={
-        "stand_fraction": 0.1,
+        "shortest_seconds": 1.0,
+        "stand_fraction": 0.15,
         "forward_fraction": 0.2,
         "slow_fraction": 0.15,
+        "top_fraction": 0.15,
         "narrow_speed": 4.0,
         "stand_still": True,
     },
@@ -63,14 +66,17 @@ _LAPTOP = _override(
         "reference_speed_gain": 1.0,
         "stride_sweep": 0.35,
         "arm_swing": 0.5,
+        "arm_swing_slow": 0.2,
         "elbow_bend": 1.0,
-        "cycle_follows_speed": True,
+        "cycle_from_speed": 0.5,
         "random_phase": True,
     },
     curriculum={
         "settle_seconds": 2.0,
         "v_limit": 4.5,
         "gait_threshold": 0.75,
+        "top_error": 0.05,
+        "top_falls": 1.0,
         "cycle_factor": 0.925,
         "cycle_min": 0.38,
     },
@@ -80,9 +86,13 @@ _LAPTOP = _override(
         "kd": (0.9, 1.1),
         "motor_strength": (0.9, 1.0),
         "joint_friction": (0.0, 1.0),
+        "link_mass": (0.9, 1.1),
+        "link_com": (-0.01, 0.01),
+        "hand_mass": (0.0, 0.5),
         "noise": (0.0, 1.0),
     },
     rewards={
+        "momentum_scale": 2.0,
         "base_height_kernel": 30.0,
         "base_height_drop": 0.0,
         "clearance_width": 0.03,
@@ -111,7 +121,7 @@ _LAPTOP = _override(
 _DEBUG = _override(
     _LAPTOP,
     env={"num_envs": 16, "frames": 3},
-    network={"actor": (32, 16), "critic": (32, 16)},
+    network={"actor": (32, 16), "critic": (32, 16), "estimator": (16,)},
     ppo={"rollout_steps": 8, "minibatches": 2, "epochs": 2},
     run={"steps": 1024, "checkpoint_minutes": 0.05},
 )
@@ -127,7 +137,10 @@ PRESETS: dict[str, Config] = {
 # The paper's ablations: one switch each, on any preset. Held arms also leave the gait's reference:
 # they cannot follow it, and the norm of Eq. 8 would pay the legs nothing for following theirs.
 ABLATIONS: dict[str, dict[str, Any]] = {
-    "arms": {"env": {"arms": "held"}, "gait": {"arm_swing": 0.0, "elbow_bend": 0.0}},
+    "arms": {
+        "env": {"arms": "held"},
+        "gait": {"arm_swing": 0.0, "arm_swing_slow": 0.0, "elbow_bend": 0.0},
+    },
     "angular-momentum": {"rewards": {"weights": {"angular_momentum": 0.0}}},
     "velocity-rewards": {"rewards": {"velocity_rewards": False}},
     "velocity-curriculum": {"curriculum": {"velocity": False, "v_start": 3.5}},

@@ -141,6 +141,9 @@ class CommandConfig:
     vy: Range = (-0.3, 0.3)
     heading: Range = (-3.14, 3.14)
     resample_seconds: float = 8.0
+    """A command holds this long at most."""
+    shortest_seconds: float = 0.0
+    """A command holds this long at least, drawn uniformly; 0: always `resample_seconds` (HG)."""
     dead_zone: float = 0.2
     """Commands whose planar norm is at most this become zero [m/s] (HG)."""
     heading_gain: float = 0.5
@@ -154,6 +157,9 @@ class CommandConfig:
     are rare."""
     slow_speed: float = 1.0
     """Fastest of those [m/s]."""
+    top_fraction: float = 0.0
+    """Share of commands whose vx is drawn from the top `curriculum.v_step` of the range. Stops from
+    the top speed and starts to it are rare otherwise."""
     narrow_speed: float = 0.0
     """Forward speed [m/s] at which vy and heading changes have shrunk to nothing; 0: never."""
     stand_still: bool = False
@@ -168,8 +174,15 @@ class CommandConfig:
             0 <= self.stand_fraction + self.forward_fraction <= 1,
             "command.stand_fraction + command.forward_fraction must lie in [0, 1]",
         )
-        require(0 <= self.slow_fraction <= 1, "command.slow_fraction must lie in [0, 1]")
+        require(
+            0 <= self.slow_fraction + self.top_fraction <= 1,
+            "command.slow_fraction + command.top_fraction must lie in [0, 1]",
+        )
         require(self.slow_speed > 0, "command.slow_speed must be positive")
+        require(
+            0 <= self.shortest_seconds <= self.resample_seconds,
+            "command.shortest_seconds must lie in [0, command.resample_seconds]",
+        )
 
 
 @dataclass(frozen=True)
@@ -194,10 +207,17 @@ class GaitConfig:
     the ground behind it."""
     arm_swing: float = 0.0
     """Shoulder reference amplitude [rad] at `full_speed`, against the same side's leg."""
+    arm_swing_slow: float = 0.0
+    """The same at the slowest walk."""
     elbow_bend: float = 0.0
     """Elbow flexion reference [rad] at `full_speed`."""
     cycle_follows_speed: bool = False
-    """True: slow commands keep `cycle_time`, only the fastest use the curriculum's."""
+    """True: slow commands keep `cycle_time`, only the fastest use the curriculum's. The cycle of a
+    command then changes whenever the range grows."""
+    cycle_from_speed: float = 0.0
+    """Above 0: a command's cycle depends on its speed alone. Up to this speed [m/s] it is
+    `cycle_time`; from there each `curriculum.v_step` shortens it by `curriculum.cycle_factor`, as
+    the curriculum does (Eq. 10), and never below the curriculum's cycle."""
     random_phase: bool = False
     """Episodes start at a random gait phase (HG: phase 0)."""
 
@@ -230,6 +250,12 @@ class RandomizeConfig:
     """Factor on the available torque, per joint."""
     joint_friction: Range = (0.0, 0.0)
     """Coulomb friction of the joints [N m]."""
+    link_mass: Range = (1.0, 1.0)
+    """Factor on the mass and inertia of each link."""
+    link_com: Range = (0.0, 0.0)
+    """Shift of each link's centre of mass, each axis [m]."""
+    hand_mass: Range = (0.0, 0.0)
+    """Added to the last link of each arm, at its centre of mass [kg]."""
     noise: Range = (1.0, 1.0)
     """Factor on sensor noise, action noise and action delay of an episode."""
     push_seconds: float = 4.0
@@ -248,8 +274,17 @@ class RandomizeConfig:
             if isinstance(value, tuple):
                 _check_range(f"randomize.{f.name}", value)
         require(self.base_mass[0] > -20, "randomize.base_mass: the base link has 21 kg to lose")
-        for name in ("kp", "kd", "motor_strength", "friction", "joint_friction", "noise"):
+        for name in (
+            "kp",
+            "kd",
+            "motor_strength",
+            "friction",
+            "joint_friction",
+            "noise",
+            "hand_mass",
+        ):
             require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
+        require(self.link_mass[0] > 0, "randomize.link_mass must be positive")
 
 
 @dataclass(frozen=True)
@@ -373,6 +408,11 @@ class CurriculumConfig:
     gait_threshold: float = -1.0
     """Least mean of the `feet_contact_number` term under fast commands, which is 1 where the feet
     follow the clock and -0.3 where they do the contrary; -1: any. A shuffle can track, too."""
+    top_error: float = 1e9
+    """Relative error of the mean speed that commands in the top `v_step` of the range may have, for
+    the range to grow: what cannot be run is not widened. 1e9: any."""
+    top_falls: float = 1e9
+    """Falls per minute that those commands may lead to. 1e9: any."""
     settle_seconds: float = 0.0
     """Tracking counts from this long after a change of the command: reaching it takes time, and the
     longer the wider the range is."""
@@ -390,6 +430,8 @@ class CurriculumConfig:
             "curriculum needs v_min <= v_start <= v_limit",
         )
         require(0 <= self.smoothing < 1, "curriculum.smoothing must lie in [0, 1)")
+        require(self.top_error > 0, "curriculum.top_error must be positive")
+        require(self.top_falls >= 0, "curriculum.top_falls must not be negative")
 
 
 @dataclass(frozen=True)
@@ -404,9 +446,12 @@ class NetworkConfig:
     symmetric: bool = False
     """Networks that commute with left-right mirroring by construction: a mirrored robot gets the
     mirrored action and the same value. At equal sizes half the work of free ones."""
+    estimator: tuple[int, ...] = ()
+    """Hidden layers of a network that estimates the base's velocity from the actor's history. The
+    actor reads the estimate beside the history. Empty: none."""
 
     def __post_init__(self):
-        sizes = self.actor + self.critic
+        sizes = self.actor + self.critic + self.estimator
         require(all(n > 0 for n in sizes), "network sizes must be positive")
         require(
             not self.symmetric or all(n % 2 == 0 for n in sizes),
@@ -426,6 +471,8 @@ class PPOConfig:
     lam: float = 0.9
     clip: float = 0.2
     value_coef: float = 1.0
+    estimate_coef: float = 1.0
+    """Weight of the velocity estimate's squared error, with `network.estimator`."""
     entropy_coef: float = 0.001
     entropy_fades: bool = False
     """True: the entropy bonus falls to nothing on the curriculum's way to `v_limit`."""
@@ -434,6 +481,9 @@ class PPOConfig:
     """Start of the adaptive schedule (Table I); it rises at once."""
     learning_rate_bounds: Range = (1e-5, 1e-2)
     desired_kl: float = 0.01
+    average: float = 0.0
+    """The policy that is saved averages the actor's parameters; they keep this share per update.
+    0: the newest parameters."""
     learning_rate_factor: float = 1.5
 
     def __post_init__(self):
@@ -444,6 +494,7 @@ class PPOConfig:
         for name in ("clip", "max_grad_norm", "desired_kl"):
             require(getattr(self, name) > 0, f"ppo.{name} must be positive")
         require(self.learning_rate_factor >= 1, "ppo.learning_rate_factor must be at least 1")
+        require(0 <= self.average < 1, "ppo.average must lie in [0, 1)")
         _check_range("ppo.learning_rate_bounds", self.learning_rate_bounds)
         low, high = self.learning_rate_bounds
         require(low > 0, "ppo.learning_rate_bounds must be positive")
@@ -494,6 +545,10 @@ class Config:
         for name, seconds in (
             ("env.episode_seconds", self.env.episode_seconds),
             ("command.resample_seconds", self.command.resample_seconds),
+            (
+                "command.shortest_seconds",
+                self.command.shortest_seconds or self.command.resample_seconds,
+            ),
             ("randomize.push_seconds", self.randomize.push_seconds or self.control_dt),
         ):
             steps = seconds / self.control_dt
@@ -503,9 +558,10 @@ class Config:
             f"env.num_envs x ppo.rollout_steps: {self.batch_size} samples are more than 2^31",
         )
         require(
-            self.env.arms == "free" or self.gait.arm_swing == self.gait.elbow_bend == 0.0,
-            "env.arms: held arms cannot follow gait.arm_swing and gait.elbow_bend, set both to 0 "
-            "(--without arms does)",
+            self.env.arms == "free"
+            or self.gait.arm_swing == self.gait.arm_swing_slow == self.gait.elbow_bend == 0.0,
+            "env.arms: held arms cannot follow gait.arm_swing, gait.arm_swing_slow and "
+            "gait.elbow_bend, set all to 0 (--without arms does)",
         )
         require(
             self.curriculum.settle_seconds < self.command.resample_seconds,
