@@ -19,8 +19,8 @@ class Controller:
     def __init__(self, path, vx, vy=0.0, heading=0.0):
         self.network = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         text = self.network.get_modelmeta().custom_metadata_map
-        if text.get("metadata_version") != "2":
-            raise SystemExit(f"error: {path} has no metadata of version 2, see docs/export.md")
+        if text.get("metadata_version") != "3":
+            raise SystemExit(f"error: {path} has no metadata of version 3, see docs/export.md")
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
         walks = np.hypot(vx, vy) > m.command.dead_zone
@@ -46,15 +46,22 @@ class Controller:
         frame = np.concatenate([values[c.name] * np.array(c.scale) for c in m.frame])
         return np.clip(frame, -m.observation_clip, m.observation_clip)
 
+    @staticmethod
+    def cycle(gait, speed):
+        """Seconds of a gait cycle at a commanded forward speed [m/s]."""
+        if gait.cycle_from_speed > 0:
+            steps = max(speed - gait.cycle_from_speed, 0) / gait.speed_step
+            return max(gait.base_cycle_time * gait.cycle_factor**steps, gait.cycle_time)
+        share = min(speed / gait.v_max, 1) if gait.cycle_follows_speed else 1
+        return gait.base_cycle_time + share * (gait.cycle_time - gait.base_cycle_time)
+
     def targets(self, *measured):
         """Joint targets [rad] until the next control step; advances clock and history."""
         m, gait = self.meta, self.meta.gait
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
         action = np.array(self.network.run(["action"], {"history": self.history[None]})[0])[0]
         self.action = np.clip(action, -m.action_clip, m.action_clip) * self.free
-        share = min(abs(self.velocity[0]) / gait.v_max, 1) if gait.cycle_follows_speed else 1
-        cycle = gait.base_cycle_time + share * (gait.cycle_time - gait.base_cycle_time)
-        self.phase = (self.phase + m.control_dt / cycle) % 1
+        self.phase = (self.phase + m.control_dt / self.cycle(gait, abs(self.velocity[0]))) % 1
         return m.default_joint_pos + m.action_scale * self.action
 
 

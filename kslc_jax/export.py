@@ -33,7 +33,7 @@ Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
 """Histories [B, K, 59] to actions [B, 16]."""
 
-METADATA_VERSION = 2
+METADATA_VERSION = 3
 """Of the names and meanings in `metadata`; grows when one of them changes."""
 
 INSTALL = "pip install 'kslc_jax[export]'"
@@ -98,6 +98,9 @@ def metadata(policy: Policy) -> dict[str, Any]:
             "v_max": float(policy.curriculum.v_max),
             "cycle_follows_speed": config.gait.cycle_follows_speed,
             "base_cycle_time": config.gait.cycle_time,
+            "cycle_from_speed": config.gait.cycle_from_speed,
+            "cycle_factor": config.curriculum.cycle_factor,
+            "speed_step": config.curriculum.v_step,
         },
         "command": {
             "dead_zone": config.command.dead_zone,
@@ -112,33 +115,33 @@ def metadata(policy: Policy) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------- onnx
 
 
-def dense_layers(config: Config, params: Params) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Kernels [in, out] and biases [out] of the actor as a plain MLP over the flat history.
+def dense_layers(
+    config: Config, params: Params, network: Literal["actor", "estimator"]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Kernels [in, out] and biases [out] of a network as a plain MLP over the flat history, for the
+    actor followed by the estimated velocity.
 
-    A symmetric actor becomes one too: its even and odd layers are the blocks of an ordinary dense
+    A symmetric network becomes one too: its even and odd layers are the blocks of an ordinary dense
     layer in the bases of `networks.parity`. That is twice the work, and a graph any runtime knows.
     """
     import jax
 
-    from kslc_jax import networks, observations, robot
+    from kslc_jax import networks, observations
 
-    actor = jax.tree.map(lambda x: np.asarray(x, np.float64), params["actor"])
-    layers = [actor[f"Dense_{i}"] for i in range(len(actor))]
+    weights = jax.tree.map(lambda x: np.asarray(x, np.float64), params[network])
+    layers = [weights[f"Dense_{i}"] for i in range(len(weights))]
     if not config.network.symmetric:
         return [(layer["kernel"], layer["bias"]) for layer in layers]
-
-    def stacked(frame: Parity) -> Parity:
-        eye = np.eye(config.env.frames)
-        return networks.Parity(np.kron(eye, frame.even), np.kron(eye, frame.odd))
 
     def pairs(size: int) -> Parity:
         return networks.parity(np.roll(np.arange(size), size // 2), np.ones(size))
 
-    bases = [
-        stacked(networks.parity(*observations.mirror_map(observations.ACTOR))),
-        *map(pairs, config.network.actor),
-        networks.parity(*robot.mirror_joints()),
-    ]
+    frame = networks.parity(*observations.mirror_map(observations.ACTOR))
+    inputs, outputs = [frame] * config.env.frames, networks.mirrored_velocity()
+    if network == "actor":
+        inputs += [outputs] if config.network.estimator else []
+        outputs = networks.mirrored_joints()
+    bases = [_stacked(inputs), *map(pairs, getattr(config.network, network)), outputs]
     return [
         (
             a.even @ even["kernel"] @ b.even.T + a.odd @ odd["kernel"] @ b.odd.T,
@@ -148,8 +151,19 @@ def dense_layers(config: Config, params: Params) -> list[tuple[np.ndarray, np.nd
     ]
 
 
+def _stacked(parts: list[Parity]) -> Parity:
+    """Bases for several vectors, one after the other."""
+    from scipy.linalg import block_diag
+
+    from kslc_jax import networks
+
+    even, odd = ([getattr(part, name) for part in parts] for name in ("even", "odd"))
+    return networks.Parity(block_diag(*even), block_diag(*odd))
+
+
 def to_onnx(policy: Policy) -> bytes:
-    """The network as ONNX: Flatten, then Gemm with Elu between; metadata as JSON values."""
+    """The network as ONNX: Flatten, then Gemm with Elu between; metadata as JSON values. An
+    estimator comes first, and Concat puts what it says behind the flat history."""
     from kslc_jax import observations
 
     try:
@@ -160,18 +174,28 @@ def to_onnx(policy: Policy) -> bytes:
     def floats(name: str, *shape: str | int):
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
 
-    layers = dense_layers(policy.config, policy.params)
-    nodes, weights = [helper.make_node("Flatten", ["history"], ["input_0"], axis=1)], []
-    for i, layer in enumerate(layers):
-        names = [f"kernel_{i}", f"bias_{i}"]
-        weights += [
-            numpy_helper.from_array(x.astype(np.float32), name)
-            for x, name in zip(layer, names, strict=True)
-        ]
-        out = "action" if i == len(layers) - 1 else f"dense_{i}"
-        nodes.append(helper.make_node("Gemm", [f"input_{i}", *names], [out]))
-        if out != "action":
-            nodes.append(helper.make_node("Elu", [out], [f"input_{i + 1}"]))
+    nodes, weights = [helper.make_node("Flatten", ["history"], ["flat"], axis=1)], []
+
+    def add(network: Literal["actor", "estimator"], value: str, result: str) -> None:
+        layers = dense_layers(policy.config, policy.params, network)
+        for i, layer in enumerate(layers):
+            names = [f"{network}_kernel_{i}", f"{network}_bias_{i}"]
+            weights.extend(
+                numpy_helper.from_array(x.astype(np.float32), name)
+                for x, name in zip(layer, names, strict=True)
+            )
+            out = result if i == len(layers) - 1 else f"{network}_dense_{i}"
+            nodes.append(helper.make_node("Gemm", [value, *names], [out]))
+            if out != result:
+                value = f"{network}_elu_{i}"
+                nodes.append(helper.make_node("Elu", [out], [value]))
+
+    seen = "flat"
+    if policy.config.network.estimator:
+        add("estimator", "flat", "velocity")
+        nodes.append(helper.make_node("Concat", ["flat", "velocity"], ["seen"], axis=1))
+        seen = "seen"
+    add("actor", seen, "action")
     history = floats("history", "batch", policy.config.env.frames, observations.ACTOR_WIDTH)
     action = floats("action", "batch", NUM_JOINTS)
     model = helper.make_model(

@@ -320,6 +320,28 @@ def test_mass_randomisation_matches_a_recompiled_model(xbot):
     np.testing.assert_allclose(heavier, base.mass / (base.mass - 4.0), rtol=1e-5)
 
 
+def test_link_randomisation_matches_a_recompiled_model(xbot):
+    """Each link by its own factor and shift, and what the hands carry."""
+    rng = np.random.default_rng(3)
+    factor, shift = rng.uniform(0.9, 1.1, 17), rng.uniform(-0.01, 0.01, (17, 3))
+    changed = randomize.nominal().replace(
+        link_mass=jnp.asarray(factor), link_com=jnp.asarray(shift), hand_mass=jnp.asarray(0.5)
+    )
+    fields = randomize.model_fields(xbot, changed, GROUND)
+    spec = mujoco.MjSpec.from_file(str(robot.MODEL_PATH))
+    names = ["base_link", *(n.replace("joint", "link") for n in xbot.joint_names)]
+    for name, f, s in zip(names, factor, shift, strict=True):
+        body = spec.body(name)
+        before = body.mass
+        body.mass = before * f + (0.5 if "elbow" in name else 0.0)
+        body.ipos = body.ipos + s
+        body.fullinertia = body.fullinertia * body.mass / before
+    model = spec.compile()
+    for name in ("body_subtreemass", "body_mass", "body_inertia"):
+        np.testing.assert_allclose(fields[name], getattr(model, name), rtol=1e-5, err_msg=name)
+    np.testing.assert_allclose(fields["body_ipos"], model.body_ipos, atol=1e-7)
+
+
 def test_divergence_shows_as_nan_not_as_a_reset():
     """C MuJoCo would restart a diverged simulation silently; then nobody could mask it."""
     step = make_step("mujoco")
@@ -344,7 +366,8 @@ def test_every_range_is_filled_independently():
     ranges = {
         **{"friction": (0.1, 2.0), "base_mass": (-5.0, 5.0), "base_com": (-0.02, 0.03)},
         **{"kp": (0.8, 1.1), "kd": (0.7, 1.3), "motor_strength": (0.9, 1.0)},
-        **{"joint_friction": (0.0, 1.0), "noise": (0.0, 0.5)},
+        **{"joint_friction": (0.0, 1.0), "noise": (0.0, 0.5), "hand_mass": (0.0, 0.5)},
+        **{"link_mass": (0.9, 1.1), "link_com": (-0.01, 0.01)},
     }
     draw = jax.vmap(lambda key: randomize.sample(RandomizeConfig(**ranges), key))
     drawn, columns = draw(jax.random.split(jax.random.key(0), 2000)), []

@@ -1,5 +1,6 @@
 """The robot's file against an independent calculation from the URDF's numbers."""
 
+import functools
 import json
 from pathlib import Path
 
@@ -326,29 +327,66 @@ def contacts(q, fidelity="high", height=2.0):
     return {frozenset((model.geom(c.geom1).name, model.geom(c.geom2).name)) for c in data.contact}
 
 
-@pytest.mark.parametrize("roll", np.linspace(0.0, 0.3, 13))
-def test_in_training_feet_and_shanks_meet_as_at_high_fidelity(roll):
-    """Legs that close like scissors: capsules stand in for the feet's boxes."""
-    closed = np.zeros(16)
-    closed[[0, 6]] = -roll, roll
-    found = {fidelity: contacts(closed, fidelity) for fidelity in ("train", "high")}
-    bumpers, feet, shanks = (
-        {f"left_{part}", f"right_{part}"} for part in ("bumper", "foot", "shank")
-    )
-    assert (shanks in found["train"]) == (shanks in found["high"])
-    assert bumpers in found["train"] or feet not in found["high"]
-    assert bool(found["train"]) == bool(found["high"])
+@functools.cache
+def in_the_air(fidelity):
+    model = robot.load(fidelity).mj_model
+    data = mujoco.MjData(model)
+    data.qpos[2] = 9.0
+    return model, data
 
 
-def test_bumpers_are_the_feet_and_a_margin(xbot):
-    margin = 0.006  # m
+def parts_that_touch(q, fidelity):
+    """Pairs of bodies, by number."""
+    model, data = in_the_air(fidelity)
+    data.qpos[7:] = q
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    return {frozenset(pair) for pair in model.geom_bodyid[data.contact.geom].tolist()}
+
+
+@pytest.mark.parametrize("spread", [0.2, 0.5, None], ids=["gaits", "wide", "limits"])
+def test_what_touches_at_high_fidelity_touches_in_training(xbot, spread):
+    """Random poses around home, and anywhere within the joint limits. A policy finds whatever may
+    pass through whatever."""
+    rng = np.random.default_rng(7)
+    low, high, touched = xbot.joint_lower, xbot.joint_upper, set()
+    for _ in range(2000):
+        q = rng.normal(0.0, spread, 16) if spread else rng.uniform(low, high)
+        q = np.clip(q, low, high)
+        found = parts_that_touch(q, "high")
+        assert found <= parts_that_touch(q, "train"), q
+        touched |= found
+    assert len(touched) >= 8
+
+
+def test_parts_are_kept_apart_a_little_before_they_touch():
+    """Legs that close like scissors meet in training first, by the margin and no more."""
+    closed, first = np.zeros(16), {}
+    for roll in np.linspace(0.0, 0.3, 301):
+        closed[[0, 6]] = -roll, roll
+        for fidelity in ("train", "high"):
+            if parts_that_touch(closed, fidelity):
+                first.setdefault(fidelity, roll)
+    leg = 0.1455 + 0.277128  # m, from the hip to the knee
+    assert 0 < 2 * leg * (first["high"] - first["train"]) < 2 * robot.PAIR_MARGIN
+
+
+def test_stand_ins_cover_their_parts():
+    """The corners of the feet's boxes with the pairs' margin, and the hand's ellipsoid."""
     for side in ("left", "right"):
-        bumper = xbot.mj_model.geom(f"{side}_bumper")
-        box = robot.load("high").mj_model.geom(f"{side}_foot")
-        radius, half_length, _ = bumper.size
-        assert radius == pytest.approx(box.size[1] + margin)
-        assert radius + half_length == pytest.approx(box.size[0] + margin)
+        bumper, box = train(f"{side}_foot_bumper"), train(f"{side}_foot")
         np.testing.assert_allclose(bumper.pos, box.pos)
+        radius, half_length = bumper.size[:2]
+        corner = np.linalg.norm(box.size - [half_length, 0, 0])
+        assert radius < corner < radius + robot.PAIR_MARGIN
+        bumper, hand = train(f"{side}_forearm_bumper"), train(f"{side}_hand")
+        assert bumper.size[0] >= hand.size[0]
+        assert bumper.pos[2] - bumper.size[:2].sum() <= hand.pos[2] - hand.size[2] + 1e-9
+
+
+def train(name):
+    return robot.load().mj_model.geom(name)
 
 
 def test_stand_ins_are_gone_at_high_fidelity():
