@@ -92,7 +92,7 @@ def test_what_the_paper_leaves_to_humanoid_gym():
     assert p.learning_rate_bounds == (1e-5, 1e-2)
     n = PAPER.network
     assert (n.actor, n.critic, n.init_std) == ((512, 256, 128), (768, 256, 128), 1.0)
-    assert not n.symmetric
+    assert not n.symmetric and not n.estimator and p.average == 0.0
     e = PAPER.env
     assert PAPER.control_dt == pytest.approx(0.01) and PAPER.episode_steps == 2400
     assert (e.action_scale, e.action_clip, e.observation_clip) == (0.25, 18.0, 18.0)
@@ -102,16 +102,18 @@ def test_what_the_paper_leaves_to_humanoid_gym():
     assert (c.vy, c.heading, c.resample_seconds) == ((-0.3, 0.3), (-3.14, 3.14), 8.0)
     assert (c.dead_zone, c.heading_gain, c.max_yaw_rate) == (0.2, 0.5, 1.0)
     assert (c.stand_fraction, c.forward_fraction, c.narrow_speed) == (0.0, 0.0, 0.0)
+    assert (c.top_fraction, c.shortest_seconds) == (0.0, 0.0)
     assert not c.stand_still
     g = PAPER.gait
     assert (g.cycle_time, g.double_support, g.reference_scale) == (0.64, 0.1, 0.17)
     assert (g.reference_speed_gain, g.arm_swing, g.elbow_bend) == (0.0, 0.0, 0.0)
-    assert not g.cycle_follows_speed and not g.random_phase
+    assert not g.cycle_follows_speed and not g.cycle_from_speed and not g.random_phase
     r = PAPER.randomize
     assert (r.friction, r.ground_friction, r.base_mass) == ((0.1, 2.0), 0.6, (-5.0, 5.0))
     assert (r.push_seconds, r.push_velocity, r.push_angular) == (4.0, 0.2, 0.4)
     assert r.kp == r.kd == r.motor_strength == (1.0, 1.0)
-    assert r.base_com == r.joint_friction == (0.0, 0.0)
+    assert r.base_com == r.joint_friction == r.link_com == r.hand_mass == (0.0, 0.0)
+    assert r.link_mass == (1.0, 1.0)
     w = PAPER.rewards
     assert (w.tracking_sigma, w.base_height_target, w.clearance_target) == (5.0, 0.89, 0.06)
     assert w.max_contact_force == 700.0
@@ -191,8 +193,12 @@ LEARNER = {
 def test_laptop_departs_from_the_paper_in_these_numbers_only():
     """docs/fidelity.md, "The laptop preset", gives the reason of each."""
     assert {k: v[1] for k, v in changes(PAPER, LAPTOP).items()} == LEARNER | {
+        "network.estimator": (128, 64),
         "ppo.entropy_fades": True,
-        "command.stand_fraction": 0.1,
+        "ppo.average": 0.98,
+        "command.shortest_seconds": 1.0,
+        "command.stand_fraction": 0.15,
+        "command.top_fraction": 0.15,
         "command.forward_fraction": 0.2,
         "command.slow_fraction": 0.15,
         "command.narrow_speed": 4.0,
@@ -201,12 +207,15 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "gait.stride_sweep": 0.35,
         "gait.reference_speed_gain": 1.0,
         "gait.arm_swing": 0.5,
+        "gait.arm_swing_slow": 0.2,
         "gait.elbow_bend": 1.0,
-        "gait.cycle_follows_speed": True,
+        "gait.cycle_from_speed": 0.5,
         "gait.random_phase": True,
         "curriculum.settle_seconds": 2.0,
         "curriculum.v_limit": 4.5,
         "curriculum.gait_threshold": 0.75,
+        "curriculum.top_error": 0.05,
+        "curriculum.top_falls": 1.0,
         "curriculum.cycle_factor": 0.925,
         "curriculum.cycle_min": 0.38,
         "randomize.base_com": (-0.02, 0.02),
@@ -214,7 +223,11 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "randomize.kd": (0.9, 1.1),
         "randomize.motor_strength": (0.9, 1.0),
         "randomize.joint_friction": (0.0, 1.0),
+        "randomize.link_mass": (0.9, 1.1),
+        "randomize.link_com": (-0.01, 0.01),
+        "randomize.hand_mass": (0.0, 0.5),
         "randomize.noise": (0.0, 1.0),
+        "rewards.momentum_scale": 2.0,
         "rewards.base_height_kernel": 30.0,
         "rewards.base_height_drop": 0.0,
         "rewards.exact_full": 2.0,
@@ -251,6 +264,7 @@ def test_debug_is_a_small_laptop():
         "env.frames": 3,
         "network.actor": (32, 16),
         "network.critic": (32, 16),
+        "network.estimator": (16,),
         "ppo.rollout_steps": 8,
         "ppo.minibatches": 2,
         "ppo.epochs": 2,
@@ -259,11 +273,14 @@ def test_debug_is_a_small_laptop():
     }
 
 
+ARMS = ("gait.arm_swing", "gait.arm_swing_slow", "gait.elbow_bend")
+
+
 @pytest.mark.parametrize("base", ["paper", "laptop"])
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        ("arms", {"env.arms": "held", "gait.arm_swing": 0.0, "gait.elbow_bend": 0.0}),
+        ("arms", dict.fromkeys(ARMS, 0.0) | {"env.arms": "held"}),
         ("angular-momentum", {"rewards.weights.angular_momentum": 0.0}),
         ("velocity-rewards", {"rewards.velocity_rewards": False}),
         ("velocity-curriculum", {"curriculum.velocity": False, "curriculum.v_start": 3.5}),

@@ -48,7 +48,7 @@ def make_policy(kind):
         config = dataclasses.replace(
             config,
             env=dataclasses.replace(config.env, arms="held"),
-            network=dataclasses.replace(config.network, symmetric=False),
+            network=dataclasses.replace(config.network, symmetric=False, estimator=()),
             gait=paper.gait,  # without a reference for the arms
             command=paper.command,
         )
@@ -120,9 +120,11 @@ def test_the_symmetric_actor_as_a_plain_mlp_mirrors(symmetric, tmp_path):
     np.testing.assert_allclose(network(mirrored), network(seen)[:, joints] * joint_sign, atol=2e-6)
 
 
-def test_the_graph_is_flatten_gemm_and_elu(onnx_file):
+def test_the_graph_estimates_the_velocity_and_then_acts(onnx_file):
     model = onnx.load(onnx_file)
-    assert [n.op_type for n in model.graph.node] == ["Flatten", *("Gemm", "Elu") * 2, "Gemm"]
+    estimator = ["Gemm", "Elu", "Gemm", "Concat"]
+    actor = ["Gemm", "Elu"] * 2 + ["Gemm"]
+    assert [n.op_type for n in model.graph.node] == ["Flatten", *estimator, *actor]
     (history,), (action,) = model.graph.input, model.graph.output
     dims = [d.dim_param or d.dim_value for d in history.type.tensor_type.shape.dim]
     assert dims == ["batch", 3, 59]
@@ -133,7 +135,7 @@ def test_the_graph_is_flatten_gemm_and_elu(onnx_file):
 def test_metadata(symmetric, xbot):
     """By literal numbers where the paper or Humanoid-Gym gives them."""
     data = export.metadata(symmetric)
-    assert data["metadata_version"] == 2 and data["train_step"] == 7
+    assert data["metadata_version"] == 3 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
     assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
     assert data["effort_limit"][3] == 212.5
@@ -146,8 +148,11 @@ def test_metadata(symmetric, xbot):
     assert data["gait"] == {
         "cycle_time": pytest.approx(CYCLE),
         "v_max": V_MAX,
-        "cycle_follows_speed": True,
+        "cycle_follows_speed": False,
         "base_cycle_time": 0.64,
+        "cycle_from_speed": 0.5,
+        "cycle_factor": 0.925,
+        "speed_step": 0.5,
     }
     assert data["command"]["stand_still"] and data["command"]["dead_zone"] == 0.2
     assert data["held_joints"] == []

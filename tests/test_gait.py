@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from states import joints, make_command, make_gait, make_signals
 
-from kslc_jax import gait, robot
+from kslc_jax import curriculum, gait, robot
 from kslc_jax.config import GaitConfig, preset
 
 DT = 0.01
@@ -147,10 +147,39 @@ def test_random_phase_fills_the_cycle():
 )
 def test_cycle_time(follows, vx, expected):
     """0.64 + g (0.48 - 0.64) where it follows the speed; g = 0.5 at 1.75 of 3.5 m/s."""
-    config = dataclasses.replace(PAPER, cycle_follows_speed=follows)
+    config = with_gait(cycle_follows_speed=follows)
     command = make_command(velocity=[vx, 0.0, 0.0])
     got = gait.cycle_time(config, command, jnp.asarray(0.48), jnp.asarray(3.5))
     assert float(got) == pytest.approx(expected, rel=1e-6)
+
+
+def with_gait(**changes):
+    config = preset("paper")
+    return dataclasses.replace(config, gait=dataclasses.replace(config.gait, **changes))
+
+
+@pytest.mark.parametrize("vx", [0.0, 0.3, 0.5, -0.3, 0.75, 1.0, 2.0, 3.3])
+def test_the_cycle_of_a_command_is_the_same_for_every_range(vx):
+    """0.64 x 0.925^((v - 0.5) / 0.5): what it was when v was the top of the range."""
+    config, command = preset("laptop"), make_command(velocity=[vx, 0.0, 0.0])
+    state, found = curriculum.init(config), []
+    open_ = dataclasses.replace(config.curriculum, cycle_min=0.38)
+    for _ in range(8):
+        if abs(vx) <= float(state.v_max):
+            cycle = gait.cycle_time(config, command, state.cycle_time, state.v_max)
+            found.append(float(cycle))
+        state = state.replace(
+            v_max=state.v_max + open_.v_step, cycle_time=state.cycle_time * open_.cycle_factor
+        )
+    expected = 0.64 * 0.925 ** (max(abs(vx) - 0.5, 0.0) / 0.5)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_the_cycle_is_never_below_the_curriculums():
+    """Without the cycle curriculum (an ablation) it stays as it is; at the end 0.38 s is left."""
+    config, command = preset("laptop"), make_command(velocity=[4.5, 0.0, 0.0])
+    assert float(gait.cycle_time(config, command, 0.64, 4.5)) == pytest.approx(0.64)
+    assert float(gait.cycle_time(config, command, 0.38, 4.5)) == pytest.approx(0.38)
 
 
 # ---------------------------------------------------------------------------------- reference pose

@@ -3,6 +3,7 @@
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -99,3 +100,27 @@ def test_networks_have_the_papers_sizes():
     shapes = lambda net: [params[net][f"Dense_{i}"]["kernel"].shape for i in range(4)]  # noqa: E731
     assert shapes("actor") == [(15 * 59, 512), (512, 256), (256, 128), (128, 16)]
     assert shapes("critic") == [(3 * 89, 768), (768, 256), (256, 128), (128, 1)]
+
+
+def test_the_estimate_mirrors_and_only_its_own_error_trains_it():
+    """vy changes its sign. The actor reads the estimate, its loss does not change the estimator."""
+    params = perturbed(CONFIG)
+    history = jax.random.normal(KEY, (CONFIG.env.frames, observations.ACTOR_WIDTH))
+    here = networks.policy_and_estimate(CONFIG, params, history)[1]
+    there = networks.policy_and_estimate(CONFIG, params, mirrored(observations.ACTOR, history))[1]
+    np.testing.assert_allclose(there, here * np.array([1.0, -1.0, 1.0]), atol=1e-6)
+    assert np.abs(here).min() > 1e-3
+
+    def act(params):
+        return jnp.sum(networks.policy(CONFIG, params, history).mean)
+
+    grads = jax.grad(act)(params)
+    assert all(not x.any() for x in jax.tree.leaves(grads["estimator"]))
+    other = {**params, "estimator": jax.tree.map(lambda x: x + 0.1, params["estimator"])}
+    assert abs(act(other) - act(params)) > 1e-4
+
+
+def test_without_an_estimator_nothing_is_estimated():
+    config = preset("paper")
+    params = jax.eval_shape(lambda: networks.init(config, KEY))
+    assert "estimator" not in params

@@ -128,7 +128,8 @@ def samples(**changes):
 def bandit_apply(params, index):
     """Policy and value that do not look at the observation."""
     mean = jnp.broadcast_to(params["mean"], (index.shape[0], 1))
-    return Gaussian(mean, params["log_std"]), jnp.broadcast_to(params["value"], index.shape)
+    value = jnp.broadcast_to(params["value"], index.shape)
+    return Gaussian(mean, params["log_std"]), value, jnp.zeros(index.shape)
 
 
 def params(mean=0.0, value=0.0):
@@ -190,7 +191,7 @@ def test_update_finds_the_best_action_of_a_bandit():
         key_act, key_update = jax.random.split(key)
         size = 512
         index = jnp.arange(size)
-        dist, value = bandit_apply(learner.params, index)
+        dist, value, _ = bandit_apply(learner.params, index)
         action = dist.sample(key_act)
         reward = -jnp.square(action[:, 0] - 2.0)
         batch = ppo.Samples(
@@ -223,3 +224,26 @@ def test_a_lowered_ceiling_rises_by_two_percent_an_update():
     low = ppo.init(config, params()).replace(rate_ceiling=jnp.asarray(1e-3))
     new, _ = ppo.update(config, bandit_apply, DRAWN, low, samples(), jax.random.key(0))
     assert float(new.rate_ceiling) == pytest.approx(1.02e-3)
+
+
+def test_the_average_of_the_acting_parameters_by_hand():
+    """0.75 of the old and 0.25 of the new; 0: the newest. The critic is not averaged."""
+    config = PPOConfig(average=0.75)
+    old, new = {"log_std": jnp.asarray(1.0)}, {"log_std": jnp.asarray(2.0)}
+    assert float(ppo.averaged(config, old, new)["log_std"]) == 1.25
+    assert float(ppo.averaged(CONFIG, old, new)["log_std"]) == 2.0
+    assert set(ppo.acting({"actor": 1, "critic": 2, "log_std": 3, "estimator": 4})) == {
+        "actor",
+        "estimator",
+        "log_std",
+    }
+
+
+def test_the_estimates_error_counts_by_its_weight():
+    def apply(params, index):
+        return *bandit_apply(params, index)[:2], jnp.array([1.0, 3.0])
+
+    config = PPOConfig(estimate_coef=0.5)
+    without, _ = ppo.loss(config, bandit_apply, DRAWN, params(), samples())
+    total, info = ppo.loss(config, apply, DRAWN, params(), samples())
+    assert info["estimate_loss"] == 2.0 and total - without == pytest.approx(1.0)
