@@ -42,8 +42,9 @@ def once(preset_name: str, num_envs: int, frames: int, repeats: int) -> dict[str
     import jax
 
     from benchmarks import throughput
-    from kslc_jax import memory, train_step
+    from kslc_jax import train_step
     from kslc_jax.config import preset
+    from kslc_jax.training import memory
 
     config = timing.resized(preset(preset_name), num_envs, frames)
     init, step = train_step.make(config)

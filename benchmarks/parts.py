@@ -21,8 +21,9 @@ import numpy as np
 import tyro
 
 from benchmarks import throughput, timeline, timing
-from kslc_jax import networks, ppo, profiling, train_step
+from kslc_jax import networks, ppo, train_step
 from kslc_jax.config import Config, preset
+from kslc_jax.training import profiling
 
 matplotlib.use("Agg")
 

@@ -30,8 +30,8 @@ from kslc_jax import config as config_lib
 from kslc_jax import evaluate, files, plots, runtime
 from kslc_jax.config import Config, ConfigError, Fidelity
 from kslc_jax.learning import LEARNING
-from kslc_jax.logs import METRICS
 from kslc_jax.plots import EVALUATION
+from kslc_jax.training.logs import METRICS
 
 WIDTH = 200
 """Columns of the table, whatever the terminal has: to be copied, not torn."""
@@ -107,7 +107,7 @@ def jobs(args: Args) -> Iterator[Job]:
 
 
 def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
-    from kslc_jax.checkpoint import has_checkpoints
+    from kslc_jax.training.checkpoint import has_checkpoints
 
     folder = args.out / f"{variant}-seed{seed}"
     preset = args.baseline if variant == "baseline" else args.preset
@@ -128,7 +128,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 
 def require_ours(job: Job) -> None:
     """ConfigError or RunError where the folder holds a training of something else."""
-    from kslc_jax import run_folder
+    from kslc_jax.training import run_folder
 
     if (job.folder / run_folder.CONFIG).exists():
         run_folder.difference(run_folder.read_config(job.folder), job.config)
@@ -201,7 +201,7 @@ def keep(run: Path, folder: Path) -> None:
     """Copies a finished run's config, versions and evaluation, and what `plots` reads of its
     learning curves and of its metrics: every tenth record, and those at which the range of commands
     grew."""
-    from kslc_jax.run_folder import CONFIG, VERSIONS
+    from kslc_jax.training.run_folder import CONFIG, VERSIONS
 
     folder.mkdir(parents=True, exist_ok=True)
     for name in (CONFIG, VERSIONS, EVALUATION):
@@ -265,7 +265,7 @@ def report(args: Args, refused: Sequence[str]) -> None:
 
 def run_all(args: Args) -> tuple[list[str], list[str]]:
     """Does what is not done before; the names of what failed, and of what is something else."""
-    from kslc_jax.run_folder import RunError
+    from kslc_jax.training.run_folder import RunError
 
     failed, refused = [], []
     todo = list(jobs(args))

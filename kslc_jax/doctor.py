@@ -120,7 +120,7 @@ def _joint_angles(engine: Literal["mujoco", "mjx"]):
 def check_renderer() -> str:
     """A picture can be drawn; in a process of its own, for GL is chosen before mujoco starts."""
     code = (
-        "from kslc_jax import render, robot; import os;"
+        "from kslc_jax import robot; from kslc_jax.viewer import render; import os;"
         "next(render.frames(robot.load('high').default_qpos[None])); print(os.environ['MUJOCO_GL'])"
     )
     done = subprocess.run(
@@ -204,7 +204,8 @@ def bad_leaves(tree: Any) -> dict[str, Any]:
 
 def replay(args: Replay) -> int:
     """Prints what goes bad in the first train step in which anything does."""
-    from kslc_jax import recovery, train_step
+    from kslc_jax import train_step
+    from kslc_jax.training import recovery
 
     config, state = recovery.read_dump(args.dump)
     _, step = train_step.make(config)
@@ -293,7 +294,7 @@ def main(argv: list[str] | None = None) -> int:
         )
         if isinstance(args, Check):
             return check()
-        from kslc_jax.checkpoint import CheckpointError
+        from kslc_jax.training.checkpoint import CheckpointError
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

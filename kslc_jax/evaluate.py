@@ -114,7 +114,8 @@ def measure(
     import jax
     import numpy as np
 
-    from kslc_jax import gait_metrics, physics, trials
+    from kslc_jax import physics
+    from kslc_jax.evaluation import gait_metrics, trials
 
     describe = describe or gait_metrics.summary
     robot, dt = physics.robot_for(setting.physics), setting.physics.control_dt
@@ -138,7 +139,7 @@ def measure(
 
 def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, float]]:
     """One row of metrics per commanded speed."""
-    from kslc_jax import trials
+    from kslc_jax.evaluation import trials
 
     engine = trials.engine(policy, args.fidelity)
     setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
@@ -169,7 +170,7 @@ def console():
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    from kslc_jax.checkpoint import CheckpointError
+    from kslc_jax.training.checkpoint import CheckpointError
 
     try:
         _report(tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.evaluate"))
@@ -183,7 +184,7 @@ def _report(args: Args) -> None:
     """Tries the policy, prints the table, keeps the numbers."""
     from rich.progress import Progress
 
-    from kslc_jax.checkpoint import load_policy
+    from kslc_jax.training.checkpoint import load_policy
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)

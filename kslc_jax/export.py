@@ -26,8 +26,8 @@ from kslc_jax import __version__, files, runtime
 from kslc_jax.config import NUM_JOINTS, Config, ConfigError
 
 if TYPE_CHECKING:
-    from kslc_jax.checkpoint import Policy
     from kslc_jax.networks import Params, Parity
+    from kslc_jax.training.checkpoint import Policy
 
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
@@ -226,7 +226,7 @@ def read_orbax(path: Path) -> Network:
     """The network of a policy folder."""
     import jax
 
-    from kslc_jax.checkpoint import load_policy
+    from kslc_jax.training.checkpoint import load_policy
 
     act = jax.jit(jax.vmap(load_policy(path).act_on))
     return lambda histories: np.asarray(act(histories))
@@ -242,7 +242,8 @@ def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
     """Histories [SAMPLES, K, 59] that the policy meets following commands of its own range."""
     import jax
 
-    from kslc_jax import env, trials
+    from kslc_jax import env
+    from kslc_jax.evaluation import trials
 
     config = trials.trial_config(policy.config, trials.Setting(policy.config.physics), robots)
 
@@ -295,7 +296,7 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.export")
-        from kslc_jax.checkpoint import CheckpointError, load_policy, save_policy
+        from kslc_jax.training.checkpoint import CheckpointError, load_policy, save_policy
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

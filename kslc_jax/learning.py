@@ -50,7 +50,7 @@ class Args:
 
 def snapshots(run: Path) -> list[Path]:
     """The policies that a run kept, oldest first; ConfigError where there is none."""
-    from kslc_jax.checkpoint import SNAPSHOTS
+    from kslc_jax.training.checkpoint import SNAPSHOTS
 
     found = sorted((p for p in run.glob(f"{SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
     if not found:
@@ -64,7 +64,8 @@ def _step(folder: Path) -> int:
 
 def curve(run: Path, args: Args, progress=lambda share: None) -> dict[str, Any]:
     """The content of learning.json: per snapshot, the speeds' survival and tracking."""
-    from kslc_jax import checkpoint, gait_metrics, trials
+    from kslc_jax.evaluation import gait_metrics, trials
+    from kslc_jax.training import checkpoint
 
     points = []
     folders = snapshots(run)
@@ -93,7 +94,7 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     from rich.progress import Progress
 
-    from kslc_jax.checkpoint import CheckpointError
+    from kslc_jax.training.checkpoint import CheckpointError
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.learning")

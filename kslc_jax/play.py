@@ -85,7 +85,7 @@ def record(args: Args, policy, settle: float = 4.0):
     import jax
     import numpy as np
 
-    from kslc_jax import trials
+    from kslc_jax.evaluation import trials
 
     velocities = np.zeros((len(args.speeds), 3))
     velocities[:, 0] = args.speeds
@@ -139,7 +139,7 @@ def film_writer():
 
 def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
     """Films the speeds one after the other at real time, commanded and actual speed written in."""
-    from kslc_jax import render
+    from kslc_jax.viewer import render
 
     imageio = film_writer()
 
@@ -160,7 +160,7 @@ def draw(args: Args, policy) -> None:
     """Writes the gait strip and the video that were asked for."""
     import matplotlib.image
 
-    from kslc_jax import render
+    from kslc_jax.viewer import render
 
     for path in (args.gait_strip, args.video):
         files.require_writable(path)
@@ -194,7 +194,7 @@ def is_local(host: str) -> bool:
 def watch(args: Args) -> None:
     """Serves the viewer until Ctrl-C."""
     try:
-        from kslc_jax.viewer import Viewer
+        from kslc_jax.viewer.app import Viewer
     except ImportError as error:
         raise ImportError(f"the viewer: {error} (pip install 'kslc_jax[viewer]')") from error
 
@@ -213,13 +213,13 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.play")
         if not args.live:
-            from kslc_jax import render  # noqa: F401 (before anything that imports mujoco)
+            from kslc_jax.viewer import render  # noqa: F401 (before anything that imports mujoco)
 
             sim2sim.simulator(args.engine)  # what is not installed is told at once
     except (ConfigError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    from kslc_jax.checkpoint import CheckpointError, load_policy
+    from kslc_jax.training.checkpoint import CheckpointError, load_policy
 
     try:
         if args.live:

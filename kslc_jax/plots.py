@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from kslc_jax.learning import LEARNING, Several
-from kslc_jax.logs import METRICS
+from kslc_jax.training.logs import METRICS
 
 Records = dict[str, np.ndarray]
 

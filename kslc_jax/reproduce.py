@@ -98,15 +98,16 @@ def compare_milestones(old: dict[str, float], new: dict[str, float]) -> list[Row
 
 def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
-    those at which each speed [m/s] was reached. Raises as `runner.train`, and Stopped."""
-    from kslc_jax import plots, runner
-    from kslc_jax.checkpoint import has_checkpoints
-    from kslc_jax.logs import Progress
+    those at which each speed [m/s] was reached. Raises as `loop.train`, and Stopped."""
+    from kslc_jax import plots
+    from kslc_jax.training import loop
+    from kslc_jax.training.checkpoint import has_checkpoints
+    from kslc_jax.training.logs import Progress
 
     run = dataclasses.replace(config.run, steps=round(until))
     config = dataclasses.replace(config, seed=args.seed, run=run)
     going_on = has_checkpoints(args.run_dir)
-    state = runner.train(config, args.run_dir, going_on, Progress(config))
+    state = loop.train(config, args.run_dir, going_on, Progress(config))
     if int(state.step) < config.num_updates:
         raise Stopped("stopped; the same command tries the policy again and goes on training")
     records = plots.read_metrics(args.run_dir)
@@ -129,7 +130,7 @@ def repeat(args: Args) -> list[Row]:
     """Everything that was asked for; ConfigError, CheckpointError or RunError where it cannot."""
     from rich.progress import Progress
 
-    from kslc_jax.checkpoint import POLICIES, load_policy
+    from kslc_jax.training.checkpoint import POLICIES, load_policy
 
     policy = load_policy(args.policy)
     folder = POLICIES / args.policy
@@ -161,9 +162,9 @@ def repeat(args: Args) -> list[Row]:
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    from kslc_jax.checkpoint import CheckpointError
-    from kslc_jax.recovery import NumbersError
-    from kslc_jax.run_folder import RunError
+    from kslc_jax.training.checkpoint import CheckpointError
+    from kslc_jax.training.recovery import NumbersError
+    from kslc_jax.training.run_folder import RunError
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.reproduce")

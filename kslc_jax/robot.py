@@ -7,14 +7,14 @@ parts, joint friction.
 
 import functools
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from kslc_jax import robots
 from kslc_jax.config import Fidelity
 
-MODEL_PATH = Path(__file__).parent / "assets" / "xbot_l.xml"
+MODEL_PATH = robots.XBOT_L
 
 _FLOOR_BIT, _PART_BIT = 1, 2
 _DECOR_GROUP = 1

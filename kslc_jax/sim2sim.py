@@ -130,7 +130,7 @@ def simulator(engine: Engine):
     if engine == "mujoco":
         return None
     try:
-        from kslc_jax import drake
+        from kslc_jax.evaluation import drake
     except ImportError as error:
         raise ConfigError(f"{error}; try: pip install 'kslc_jax[drake]'") from error
     return drake.step
@@ -138,7 +138,7 @@ def simulator(engine: Engine):
 
 def setting(args: Args, condition: str):
     """The conditions of one sweep, a `trials.Setting`."""
-    from kslc_jax import trials
+    from kslc_jax.evaluation import trials
 
     made = changes(condition)
     robot = {name: value for name, value in made.items() if name in _ROBOT}
@@ -190,7 +190,7 @@ def summary(results: Results, title: str):
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    from kslc_jax.checkpoint import CheckpointError
+    from kslc_jax.training.checkpoint import CheckpointError
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.sim2sim")
@@ -206,7 +206,7 @@ def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, keeps the numbers."""
     from rich.progress import Progress
 
-    from kslc_jax.checkpoint import load_policy
+    from kslc_jax.training.checkpoint import load_policy
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)

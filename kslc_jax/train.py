@@ -82,7 +82,7 @@ def join(argv: list[str]) -> None:
     given = tuple(vars(known).values())
     if any(given) and not {"-h", "--help"} & set(argv):
         who = cluster(*given)
-        from kslc_jax import devices
+        from kslc_jax.training import devices
 
         devices.join(*who)
 
@@ -116,7 +116,7 @@ def parse(argv: list[str]) -> Args:
     if known.resume and known.run_dir is None and not helping:
         raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
     if known.resume and not helping and known.preset is None and not known.without:
-        from kslc_jax import run_folder
+        from kslc_jax.training import run_folder
 
         base = run_folder.read_config(known.run_dir)
     else:  # also on resume: the runner names what the stored config has otherwise
@@ -155,7 +155,7 @@ def main(argv: list[str] | None = None) -> int:
         join(argv)
         args = parse(argv)
         runtime.require_good_jax()
-        from kslc_jax import devices
+        from kslc_jax.training import devices
 
         mesh = devices.pick(args.config, None if args.devices == "auto" else args.devices)
     except (ConfigError, RuntimeError) as error:
@@ -168,20 +168,20 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     """The exit code. A process of several whose failure is its own ends at once."""
     from rich.console import Console
 
-    from kslc_jax import devices, runner
-    from kslc_jax.checkpoint import CheckpointError
-    from kslc_jax.logs import Progress
-    from kslc_jax.recovery import NumbersError
-    from kslc_jax.run_folder import RunError
+    from kslc_jax.training import devices, loop
+    from kslc_jax.training.checkpoint import CheckpointError
+    from kslc_jax.training.logs import Progress
+    from kslc_jax.training.recovery import NumbersError
+    from kslc_jax.training.run_folder import RunError
 
     title, run_dir = headline(args)
     progress = Progress(args.config, None if devices.is_first() else Console(quiet=True))
-    progress.say(f"{title}: {runner.describe(args.config, run_dir, mesh)}")
+    progress.say(f"{title}: {loop.describe(args.config, run_dir, mesh)}")
     if idle := runtime.idle_gpu():
         progress.warn(idle)
     how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
     try:
-        runner.train(args.config, run_dir, args.resume, progress, **how)
+        loop.train(args.config, run_dir, args.resume, progress, **how)
     except (ConfigError, RunError, CheckpointError, devices.Elsewhere) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

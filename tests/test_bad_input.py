@@ -20,7 +20,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from kslc_jax import (
-    checkpoint,
     compare,
     doctor,
     evaluate,
@@ -35,6 +34,7 @@ from kslc_jax import (
     train_step,
 )
 from kslc_jax.config import PRESETS, ConfigError, preset, to_dict
+from kslc_jax.training import checkpoint
 
 few = settings(
     max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -338,7 +338,7 @@ class TestPlay:
 
     def test_drake_is_not_installed(self, monkeypatch, tmp_path):
         """Told before the policy is looked for."""
-        monkeypatch.setitem(sys.modules, "kslc_jax.drake", None)
+        monkeypatch.setitem(sys.modules, "kslc_jax.evaluation.drake", None)
         assert "kslc_jax[drake]" in refused(play.main, tmp_path, *PICTURE, "--engine", "drake")
 
     def test_drake_has_no_training_engine(self, policy):

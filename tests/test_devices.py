@@ -18,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
+from processes import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
 
-from kslc_jax import checkpoint, devices, env, observations, physics, train, train_step
+from kslc_jax import env, observations, physics, train, train_step
 from kslc_jax.config import NUM_JOINTS, ConfigError, preset
+from kslc_jax.training import checkpoint, devices
 
 STEPS = 3
 MJX = dataclasses.replace(preset("debug"), physics=physics.PhysicsConfig(engine="mjx"))

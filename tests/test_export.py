@@ -15,19 +15,10 @@ import numpy as np
 import onnx
 import pytest
 
-from kslc_jax import (
-    checkpoint,
-    curriculum,
-    env,
-    export,
-    networks,
-    observations,
-    physics,
-    randomize,
-    robot,
-    trials,
-)
+from kslc_jax import curriculum, env, export, networks, observations, physics, randomize, robot
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
+from kslc_jax.evaluation import trials
+from kslc_jax.training import checkpoint
 
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55

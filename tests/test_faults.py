@@ -18,22 +18,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import METRICS
+from processes import METRICS
 
-from kslc_jax import (
-    checkpoint,
-    doctor,
-    physics,
-    ppo,
-    recovery,
-    run_folder,
-    runtime,
-    train,
-    train_step,
-)
-from kslc_jax.checkpoint import CheckpointError, Store
+from kslc_jax import doctor, physics, ppo, runtime, train, train_step
 from kslc_jax.config import preset, to_dict
-from kslc_jax.logs import MetricsFile
+from kslc_jax.training import checkpoint, recovery, run_folder
+from kslc_jax.training.checkpoint import CheckpointError, Store
+from kslc_jax.training.logs import MetricsFile
 
 ROOT = Path(__file__).parents[1]
 DEBUG = preset("debug")
@@ -663,7 +654,7 @@ class TestDoctor:
 
     def test_a_package_that_cannot_be_imported_is_no_traceback(self, monkeypatch, capsys):
         """The table is there for machines where JAX or orbax is broken."""
-        for name in ("jax", "orbax.checkpoint", "kslc_jax.checkpoint"):
+        for name in ("jax", "orbax.checkpoint", "kslc_jax.training.checkpoint"):
             monkeypatch.setitem(sys.modules, name, None)
         monkeypatch.setattr(doctor, "CHECKS", (("jax", doctor.check_jax, "install another"),))
         assert doctor.main(["check"]) == 1

@@ -5,8 +5,9 @@ import dataclasses
 import jax
 import pytest
 
-from kslc_jax import memory, train_step
+from kslc_jax import train_step
 from kslc_jax.config import Config, ConfigError, preset
+from kslc_jax.training import memory
 
 PAPER = preset("paper")
 

@@ -14,11 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import DEBUG, METRICS, alone, ended, rows, started, wait_for_rows
 from jax.sharding import NamedSharding, PartitionSpec
+from processes import DEBUG, METRICS, alone, ended, rows, started, wait_for_rows
 
-from kslc_jax import checkpoint, devices, recovery, run_folder, train, train_step
+from kslc_jax import train, train_step
 from kslc_jax.config import preset
+from kslc_jax.training import checkpoint, devices, recovery, run_folder
 
 BATCH = preset("debug").batch_size
 

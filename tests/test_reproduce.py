@@ -8,9 +8,10 @@ import jax
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, plots, reproduce, runner, runtime
+from kslc_jax import curriculum, networks, plots, reproduce, runtime
 from kslc_jax.config import preset
-from kslc_jax.recovery import NumbersError
+from kslc_jax.training import checkpoint, loop
+from kslc_jax.training.recovery import NumbersError
 
 
 @pytest.fixture
@@ -98,7 +99,7 @@ def trained(shipped, monkeypatch):
         (run_dir / "metrics.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
         return types.SimpleNamespace(step=round(outcome["steps"] * config.num_updates))
 
-    monkeypatch.setattr(runner, "train", fake)
+    monkeypatch.setattr(loop, "train", fake)
     return outcome
 
 

@@ -9,20 +9,11 @@ import jax
 import numpy as np
 import pytest
 
-import kslc_jax
-from kslc_jax import (
-    checkpoint,
-    curriculum,
-    env,
-    evaluate,
-    gait_metrics,
-    networks,
-    randomize,
-    robot,
-    sim2sim,
-    trials,
-)
+import kslc_jax.evaluation
+from kslc_jax import curriculum, env, evaluate, networks, randomize, robot, sim2sim
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
+from kslc_jax.evaluation import gait_metrics, trials
+from kslc_jax.training import checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -202,8 +193,8 @@ def test_errors_are_one_line(argv, says, capsys):
 
 
 def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "kslc_jax.drake", None)
-    monkeypatch.delattr(kslc_jax, "drake", raising=False)
+    monkeypatch.setitem(sys.modules, "kslc_jax.evaluation.drake", None)
+    monkeypatch.delattr(kslc_jax.evaluation, "drake", raising=False)
     assert sim2sim.main(["x", "--engine", "drake"]) == 2
     assert "pip install 'kslc_jax[drake]'" in capsys.readouterr().err
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, networks, train_step
+from kslc_jax import networks, train_step
 from kslc_jax.config import preset
+from kslc_jax.training import checkpoint
 
 
 @pytest.fixture(scope="module")

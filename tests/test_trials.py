@@ -10,18 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import (
-    checkpoint,
-    commands,
-    curriculum,
-    env,
-    evaluate,
-    gait_metrics,
-    networks,
-    observations,
-    trials,
-)
+from kslc_jax import commands, curriculum, env, evaluate, networks, observations
 from kslc_jax.config import HighFidelity, PhysicsConfig, preset
+from kslc_jax.evaluation import gait_metrics, trials
+from kslc_jax.training import checkpoint
 
 DT = 0.01
 

@@ -18,9 +18,12 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-import kslc_jax
-from kslc_jax import checkpoint, config, curriculum, networks, play, robot, session, trials
+import kslc_jax.viewer
+from kslc_jax import config, curriculum, networks, play, robot
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
+from kslc_jax.evaluation import trials
+from kslc_jax.training import checkpoint
+from kslc_jax.viewer import session
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
@@ -126,7 +129,9 @@ def volume(model, geom) -> float:
 
 
 def test_meshes_have_the_geoms_size_and_place():
-    viewer = pytest.importorskip("kslc_jax.viewer", reason="the extra 'viewer' is not installed")
+    viewer = pytest.importorskip(
+        "kslc_jax.viewer.app", reason="the extra 'viewer' is not installed"
+    )
     model = robot.load("high").mj_model
     drawn = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     assert len(drawn) > 40
@@ -140,7 +145,7 @@ def test_meshes_have_the_geoms_size_and_place():
 def viewer(run_dir):
     """A viewer on a free port; nothing runs but what a test asks for."""
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
-    from kslc_jax.viewer import Viewer
+    from kslc_jax.viewer.app import Viewer
 
     made = Viewer(run_dir, "train", port=0)
     yield made
@@ -226,7 +231,7 @@ def test_the_page_says_when_it_is_too_slow(viewer, monkeypatch):
 
 def test_policies_of_a_run(run_dir):
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
-    from kslc_jax.viewer import policies
+    from kslc_jax.viewer.app import policies
 
     found = policies(run_dir)
     assert list(found)[:2] == [str(run_dir), "step 2"]
@@ -252,7 +257,7 @@ def test_port_in_use_is_one_line(run_dir, capsys):
 
 
 def test_viewer_not_installed_is_one_line(run_dir, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "kslc_jax.viewer", None)
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.app", None)
     assert play.main([str(run_dir)]) == 2
     err = capsys.readouterr().err.strip().splitlines()
     assert len(err) == 1 and "pip install 'kslc_jax[viewer]'" in err[0]
@@ -294,8 +299,8 @@ def test_video_carries_the_speeds(monkeypatch, tmp_path):
     imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
     pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
     blank = SimpleNamespace(frames=lambda qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos))
-    monkeypatch.setitem(sys.modules, "kslc_jax.render", blank)
-    monkeypatch.setattr(kslc_jax, "render", blank, raising=False)
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
+    monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
     said = []
     write = play.caption
     monkeypatch.setattr(play, "caption", lambda p, text: said.append(text) or write(p, text))
@@ -320,8 +325,8 @@ def test_what_is_shown_ends_with_the_fall(fall, steps):
 
 
 def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "kslc_jax.render", SimpleNamespace())
-    monkeypatch.setattr(kslc_jax, "render", SimpleNamespace(), raising=False)
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", SimpleNamespace())
+    monkeypatch.setattr(kslc_jax.viewer, "render", SimpleNamespace(), raising=False)
     monkeypatch.setattr(play, "record", None)
     (tmp_path / "file").touch()
     for name, out in (("gait_strip", "out.png"), ("video", "out.mp4")):
@@ -355,7 +360,7 @@ def test_the_page(run_dir):
     browser_path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser_path is None:
         pytest.skip(f"none of {', '.join(BROWSERS)} is installed")
-    from kslc_jax.viewer import Viewer
+    from kslc_jax.viewer.app import Viewer
 
     made = Viewer(run_dir, "train", port=0)
     stop = threading.Event()

@@ -17,11 +17,12 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from kslc_jax import checkpoint, runtime, train_step
-from kslc_jax.checkpoint import CheckpointError, Policy, Store, host_array, typed
+from kslc_jax import runtime, train_step
 from kslc_jax.config import Config
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
+from kslc_jax.training import checkpoint
+from kslc_jax.training.checkpoint import CheckpointError, Policy, Store, host_array, typed
 
 
 class Saves(Protocol):

@@ -6,12 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, physics, randomize, trials
+from kslc_jax import curriculum, networks, physics, randomize
 from kslc_jax.config import HighFidelity, preset
+from kslc_jax.evaluation import trials
+from kslc_jax.training import checkpoint
 
 pytest.importorskip("pydrake", reason="Drake is an optional extra")
 
-from kslc_jax import drake
+from kslc_jax.evaluation import drake
 
 CONFIG = HighFidelity()
 NOMINAL = jax.tree.map(np.asarray, randomize.nominal())

@@ -19,11 +19,13 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from kslc_jax import checkpoint, panel, trials
 from kslc_jax import robot as robot_lib
-from kslc_jax.checkpoint import CheckpointError, Policy, load_policy
 from kslc_jax.config import ConfigError, Fidelity
-from kslc_jax.session import Pacer, Session, View
+from kslc_jax.evaluation import trials
+from kslc_jax.training import checkpoint
+from kslc_jax.training.checkpoint import CheckpointError, Policy, load_policy
+from kslc_jax.viewer import panel
+from kslc_jax.viewer.session import Pacer, Session, View
 
 FPS = 30
 PANEL_HZ = 10

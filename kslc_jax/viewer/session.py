@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import env, maths, physics, signals, trials
-from kslc_jax.checkpoint import Policy
+from kslc_jax import env, maths, physics, signals
 from kslc_jax.config import Config, PhysicsConfig
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.evaluation import trials
 from kslc_jax.networks import Params
+from kslc_jax.training.checkpoint import Policy
 
 FALLEN_SECONDS = 1.0
 """How long a fallen robot lies there before it starts anew."""

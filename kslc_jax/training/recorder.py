@@ -11,13 +11,13 @@ import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 
-from kslc_jax import checkpoint
-from kslc_jax.checkpoint import BEST_METRIC, CheckpointError, Policy
 from kslc_jax.config import Config
-from kslc_jax.disk import Saves
-from kslc_jax.logs import MetricsFile, Progress
-from kslc_jax.run_folder import writing
 from kslc_jax.train_step import TrainState
+from kslc_jax.training import checkpoint
+from kslc_jax.training.checkpoint import BEST_METRIC, CheckpointError, Policy
+from kslc_jax.training.checkpoint_process import Saves
+from kslc_jax.training.logs import MetricsFile, Progress
+from kslc_jax.training.run_folder import writing
 
 Record = dict[str, float]
 

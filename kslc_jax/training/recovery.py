@@ -16,10 +16,10 @@ import numpy as np
 
 from kslc_jax import config as config_lib
 from kslc_jax import train_step
-from kslc_jax.checkpoint import CheckpointError, host_array, typed
 from kslc_jax.config import Config
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
+from kslc_jax.training.checkpoint import CheckpointError, host_array, typed
 
 PATIENCE = 10
 """Train steps in a row without one finite update, after which a training goes back."""

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import jax
 
-from kslc_jax import checkpoint
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.files import write_whole
-from kslc_jax.logs import rows_written
 from kslc_jax.runtime import first_line
+from kslc_jax.training import checkpoint
+from kslc_jax.training.logs import rows_written
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 

@@ -20,17 +20,18 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from kslc_jax import devices, memory, physics, profiling, recovery, train_step
+from kslc_jax import physics, train_step
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.disk import Disk, DiskProcess
-from kslc_jax.keeper import Keeper, Onlooker, Record, snapshot_due
-from kslc_jax.logs import Progress
 from kslc_jax.networks import Params
-from kslc_jax.recovery import Health, WentBad
-from kslc_jax.run_folder import locked, open_folder, writing
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
+from kslc_jax.training import devices, memory, profiling, recovery
+from kslc_jax.training.checkpoint_process import Disk, DiskProcess
+from kslc_jax.training.logs import Progress
+from kslc_jax.training.recorder import Keeper, Onlooker, Record, snapshot_due
+from kslc_jax.training.recovery import Health, WentBad
+from kslc_jax.training.run_folder import locked, open_folder, writing
 
 ONE_WISH = 1.0
 """Seconds within which signals count as one: a scheduler that signals every process of a job tells
