@@ -294,7 +294,7 @@ def main(argv: list[str] | None = None) -> int:
         )
         if isinstance(args, Check):
             return check()
-        from kslc_jax.training.checkpoint import CheckpointError
+        from kslc_jax.checkpoint_format import CheckpointError
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -170,7 +170,7 @@ def console():
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    from kslc_jax.training.checkpoint import CheckpointError
+    from kslc_jax.checkpoint_format import CheckpointError
 
     try:
         _report(tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.evaluate"))
@@ -184,7 +184,7 @@ def _report(args: Args) -> None:
     """Tries the policy, prints the table, keeps the numbers."""
     from rich.progress import Progress
 
-    from kslc_jax.training.checkpoint import load_policy
+    from kslc_jax.policy import load_policy
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)

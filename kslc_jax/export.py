@@ -27,7 +27,7 @@ from kslc_jax.config import NUM_JOINTS, Config, ConfigError
 
 if TYPE_CHECKING:
     from kslc_jax.networks import Params, Parity
-    from kslc_jax.training.checkpoint import Policy
+    from kslc_jax.policy import Policy
 
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
@@ -226,7 +226,7 @@ def read_orbax(path: Path) -> Network:
     """The network of a policy folder."""
     import jax
 
-    from kslc_jax.training.checkpoint import load_policy
+    from kslc_jax.policy import load_policy
 
     act = jax.jit(jax.vmap(load_policy(path).act_on))
     return lambda histories: np.asarray(act(histories))
@@ -296,7 +296,8 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.export")
-        from kslc_jax.training.checkpoint import CheckpointError, load_policy, save_policy
+        from kslc_jax.checkpoint_format import CheckpointError
+        from kslc_jax.policy import load_policy, save_policy
     except ConfigError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -19,9 +19,6 @@ import tyro
 from kslc_jax import evaluate, files, runtime
 from kslc_jax.config import ConfigError
 
-LEARNING = "learning.json"
-"""The file's name in a run folder."""
-
 Several = Annotated[
     tyro.conf.Positional[tuple[Path, ...]],
     tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="(at least one)"),
@@ -50,9 +47,7 @@ class Args:
 
 def snapshots(run: Path) -> list[Path]:
     """The policies that a run kept, oldest first; ConfigError where there is none."""
-    from kslc_jax.training.checkpoint import SNAPSHOTS
-
-    found = sorted((p for p in run.glob(f"{SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
+    found = sorted((p for p in run.glob(f"{files.SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
     if not found:
         raise ConfigError(f"{run} holds no snapshots (trained with --run.snapshots 0?)")
     return found
@@ -65,12 +60,12 @@ def _step(folder: Path) -> int:
 def curve(run: Path, args: Args, progress=lambda share: None) -> dict[str, Any]:
     """The content of learning.json: per snapshot, the speeds' survival and tracking."""
     from kslc_jax.evaluation import gait_metrics, trials
-    from kslc_jax.training import checkpoint
+    from kslc_jax.policy import load_policy
 
     points = []
     folders = snapshots(run)
     for i, folder in enumerate(folders):
-        policy = checkpoint.load_policy(folder)
+        policy = load_policy(folder)
         setting = trials.Setting(policy.config.physics, seconds=args.seconds)
         rows = evaluate.measure(
             policy,
@@ -94,7 +89,7 @@ def main(argv: list[str] | None = None) -> int:
     runtime.prepare()
     from rich.progress import Progress
 
-    from kslc_jax.training.checkpoint import CheckpointError
+    from kslc_jax.checkpoint_format import CheckpointError
 
     try:
         args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.learning")
@@ -104,8 +99,8 @@ def main(argv: list[str] | None = None) -> int:
             for run in args.runs:
                 task = bar.add_task(str(run), total=1.0)
                 found = curve(run, args, lambda done, task=task: bar.update(task, completed=done))
-                files.write_json(run / LEARNING, found)
-                bar.console.print(f"wrote {run / LEARNING}")
+                files.write_json(run / files.LEARNING, found)
+                bar.console.print(f"wrote {run / files.LEARNING}")
     except (CheckpointError, ConfigError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

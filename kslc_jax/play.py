@@ -219,7 +219,8 @@ def main(argv: list[str] | None = None) -> int:
     except (ConfigError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    from kslc_jax.training.checkpoint import CheckpointError, load_policy
+    from kslc_jax.checkpoint_format import CheckpointError
+    from kslc_jax.policy import load_policy
 
     try:
         if args.live:

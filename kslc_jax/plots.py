@@ -21,8 +21,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from kslc_jax.learning import LEARNING, Several
-from kslc_jax.training.logs import METRICS
+from kslc_jax import files
+from kslc_jax.learning import Several
 
 Records = dict[str, np.ndarray]
 
@@ -39,9 +39,6 @@ COLUMNS = ("env_steps", "seconds", *(name for name, _, _ in PANELS))
 
 LEARNT = ("command", "survival", "forward_mean")
 """What the rows of a learning.json have to hold."""
-
-EVALUATION = "evaluation.json"
-"""What `compare` calls an evaluation in a run folder."""
 
 PERFORMANCE: tuple[tuple[str, str], ...] = (
     ("forward_mean", "mean forward speed [m/s]"),
@@ -60,9 +57,9 @@ MOMENTUM: tuple[tuple[str, str], ...] = (
 
 def read_metrics(path: Path) -> Records:
     """Columns of a metrics.jsonl, or of the one in a run folder; ValueError if there is none."""
-    path = path / METRICS if path.is_dir() else path
+    path = path / files.METRICS if path.is_dir() else path
     if not path.is_file():
-        raise ValueError(f"no {METRICS} at {path}")
+        raise ValueError(f"no {files.METRICS} at {path}")
     try:
         rows = [json.loads(line) for line in path.read_text().splitlines()]
         records = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
@@ -126,7 +123,7 @@ def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, flo
             _ = [float(row["command"]) for row in rows]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is no evaluation (of evaluate or sim2sim --json)") from error
-        name = path.resolve().parent.name if path.name == EVALUATION else path.stem
+        name = path.resolve().parent.name if path.name == files.EVALUATION else path.stem
         found.setdefault(_method(name), []).append(rows)
     for name, seeds in found.items():
         if len({tuple(row["command"] for row in rows) for rows in seeds}) > 1:
@@ -152,7 +149,7 @@ def read_learning(paths: Sequence[Path]) -> dict[str, list[Curve]]:
     seeds of its method have; ValueError where they do not fit together."""
     found: dict[str, list[Curve]] = {}
     for path in paths:
-        file = path / LEARNING if path.is_dir() else path
+        file = path / files.LEARNING if path.is_dir() else path
         try:
             content = json.loads(file.read_text())
             found.setdefault(_method(content["run"]), []).append(_curve(content["points"]))

@@ -19,12 +19,10 @@ from typing import Any
 import tyro
 
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, runtime
+from kslc_jax import evaluate, files, runtime
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.plots import EVALUATION
 
 SHIPPED = "xbot_l_run"
-MILESTONES = "milestones.json"
 
 BANDS = {
     "survival": 0.15,
@@ -100,8 +98,8 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
     those at which each speed [m/s] was reached. Raises as `loop.train`, and Stopped."""
     from kslc_jax import plots
+    from kslc_jax.checkpoint_format import has_checkpoints
     from kslc_jax.training import loop
-    from kslc_jax.training.checkpoint import has_checkpoints
     from kslc_jax.training.logs import Progress
 
     run = dataclasses.replace(config.run, steps=round(until))
@@ -130,11 +128,11 @@ def repeat(args: Args) -> list[Row]:
     """Everything that was asked for; ConfigError, CheckpointError or RunError where it cannot."""
     from rich.progress import Progress
 
-    from kslc_jax.training.checkpoint import POLICIES, load_policy
+    from kslc_jax.policy import POLICIES, load_policy
 
     policy = load_policy(args.policy)
     folder = POLICIES / args.policy
-    old = stored(folder, EVALUATION)
+    old = stored(folder, files.EVALUATION)
     how = evaluate.Args(
         Path(args.policy),
         speeds=tuple(row["command"] for row in old["rows"]),
@@ -151,7 +149,7 @@ def repeat(args: Args) -> list[Row]:
     rows = compare_rows(old["rows"], new)
     screen.print(report(rows, f"{args.policy}: evaluation"))
     if args.train:
-        milestones = stored(folder, MILESTONES)
+        milestones = stored(folder, files.MILESTONES)
         found = retrain(args, policy.config, LATER * max(milestones.values()))
         trained = compare_milestones(milestones, found)
         screen.print(report(trained, f"{args.policy}: training, at most {LATER:g} times as long"))
@@ -162,7 +160,7 @@ def repeat(args: Args) -> list[Row]:
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     runtime.prepare()
-    from kslc_jax.training.checkpoint import CheckpointError
+    from kslc_jax.checkpoint_format import CheckpointError
     from kslc_jax.training.recovery import NumbersError
     from kslc_jax.training.run_folder import RunError
 

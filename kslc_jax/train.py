@@ -168,8 +168,8 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     """The exit code. A process of several whose failure is its own ends at once."""
     from rich.console import Console
 
+    from kslc_jax.checkpoint_format import CheckpointError
     from kslc_jax.training import devices, loop
-    from kslc_jax.training.checkpoint import CheckpointError
     from kslc_jax.training.logs import Progress
     from kslc_jax.training.recovery import NumbersError
     from kslc_jax.training.run_folder import RunError

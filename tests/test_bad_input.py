@@ -33,6 +33,7 @@ from kslc_jax import (
     train,
     train_step,
 )
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import PRESETS, ConfigError, preset, to_dict
 from kslc_jax.training import checkpoint
 
@@ -234,7 +235,7 @@ def policy(tmp_path_factory):
 
 
 def test_policy_loads_from_a_path_with_anything_in_it(policy):
-    assert checkpoint.load_policy(policy).config == preset("debug")
+    assert policy_lib.load_policy(policy).config == preset("debug")
 
 
 PICTURE = ("--gait-strip", "strip.png")

@@ -15,10 +15,20 @@ import numpy as np
 import onnx
 import pytest
 
-from kslc_jax import curriculum, env, export, networks, observations, physics, randomize, robot
+from kslc_jax import (
+    checkpoint_format,
+    curriculum,
+    env,
+    export,
+    networks,
+    observations,
+    physics,
+    randomize,
+    robot,
+)
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import trials
-from kslc_jax.training import checkpoint
 
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
@@ -50,7 +60,7 @@ def make_policy(kind):
     reached = curriculum.init(config).replace(
         v_max=jnp.asarray(V_MAX), cycle_time=jnp.asarray(CYCLE)
     )
-    return checkpoint.Policy(config, params, reached, 7)
+    return policy_lib.Policy(config, params, reached, 7)
 
 
 @pytest.fixture(scope="module")
@@ -180,17 +190,17 @@ def test_without_onnxruntime_it_says_so(policy, onnx_file, monkeypatch):
 @pytest.fixture(scope="module")
 def saved(symmetric, tmp_path_factory):
     folder = tmp_path_factory.mktemp("policies") / "saved"
-    checkpoint.save_policy(symmetric, folder)
+    policy_lib.save_policy(symmetric, folder)
     return folder
 
 
 def test_a_policy_folder_is_the_whole_policy(symmetric, saved):
-    back = checkpoint.load_policy(saved)
+    back = policy_lib.load_policy(saved)
     assert back.config == symmetric.config and back.step == symmetric.step
     jax.tree.map(np.testing.assert_array_equal, back.params, symmetric.params)
     jax.tree.map(np.testing.assert_array_equal, back.curriculum, symmetric.curriculum)
-    with pytest.raises(checkpoint.CheckpointError, match="cannot write"):
-        checkpoint.save_policy(symmetric, saved)
+    with pytest.raises(checkpoint_format.CheckpointError, match="cannot write"):
+        policy_lib.save_policy(symmetric, saved)
 
 
 def test_orbax_has_to_be_asked_for(saved, tmp_path, capsys, monkeypatch):

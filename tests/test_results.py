@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from kslc_jax import compare, evaluate, plots
-from kslc_jax.training.checkpoint import POLICIES
+from kslc_jax.policy import POLICIES
 
 DOCS = Path(__file__).parents[1] / "docs"
 

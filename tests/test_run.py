@@ -23,7 +23,9 @@ import pytest
 from rich.console import Console
 
 import kslc_jax
-from kslc_jax import learning, runtime, train, train_step
+from kslc_jax import files, learning, runtime, train, train_step
+from kslc_jax import policy as policy_lib
+from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import ConfigError, preset
 from kslc_jax.training import checkpoint, checkpoint_process, loop, recorder, run_folder
 from kslc_jax.training.logs import MetricsFile, Progress
@@ -186,7 +188,7 @@ def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
     run_dir = tmp_path / "r"
     old = kslc_jax.load_policy(whole[0])
     old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
-    checkpoint.save_policy(old, tmp_path / "p")
+    policy_lib.save_policy(old, tmp_path / "p")
     init, _ = train_step.make(preset("debug"))
     begin, origin = loop._starting_from(
         tmp_path / "p", preset("debug"), init, checkpoint_process.Disk(), None
@@ -243,7 +245,7 @@ def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
     shutil.rmtree(folders[0])
     args = ["--speeds", "0", "1", "--seeds", "2", "--seconds", "3"]
     assert learning.main([str(run_dir), *args]) == 0
-    points = json.loads((run_dir / learning.LEARNING).read_text())["points"]
+    points = json.loads((run_dir / files.LEARNING).read_text())["points"]
     assert [p["env_steps"] for p in points] == [128 * i for i in range(2, 9)]
     assert all([row["command"] for row in p["rows"]] == [0.0, 1.0] for p in points)
     assert learning.main([str(tmp_path), *args]) == 2
@@ -385,13 +387,13 @@ class TestErrors:
         assert "cannot write" in fails(*DEBUG, "--run-dir", tmp_path / "file" / "r")
 
     def test_policy_not_there(self):
-        with pytest.raises(checkpoint.CheckpointError, match="no run, checkpoint or shipped"):
+        with pytest.raises(CheckpointError, match="no run, checkpoint or shipped"):
             kslc_jax.load_policy("no-such-policy")
 
     def test_damaged_policy(self, whole, tmp_path):
         shutil.copytree(whole[0], tmp_path / "r")
         damage(tmp_path / "r" / "checkpoints" / "8")
-        with pytest.raises(checkpoint.CheckpointError, match="no readable checkpoint"):
+        with pytest.raises(CheckpointError, match="no readable checkpoint"):
             kslc_jax.load_policy(tmp_path / "r")
 
 

@@ -11,9 +11,9 @@ import pytest
 
 import kslc_jax.evaluation
 from kslc_jax import curriculum, env, evaluate, networks, randomize, robot, sim2sim
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import gait_metrics, trials
-from kslc_jax.training import checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def random_policy():
     config = preset("debug")
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, init_mean=1.0))
     params = networks.init(config, jax.random.key(1))
-    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+    return policy_lib.Policy(config, params, curriculum.init(config), 0)
 
 
 @pytest.fixture
@@ -144,7 +144,7 @@ def test_report(random_policy, monkeypatch, tmp_path, capsys):
         return [{"command": v, "survival": 0.5, "forward_mean": v - extra} for v in speeds]
 
     monkeypatch.setattr(evaluate, "measure", measure)
-    monkeypatch.setattr(checkpoint, "load_policy", lambda path: random_policy)
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: random_policy)
     out = tmp_path / "deep" / "out.json"
     argv = ["p", "--speeds", "1", "2", "--perturb", "payload=0.25", "--latency", "--json", str(out)]
     assert sim2sim.main(argv) == 0
@@ -167,7 +167,7 @@ def test_a_side_step_and_a_turn_are_commanded_with_every_speed(random_policy, mo
     monkeypatch.setattr(trials, "join", lambda pieces: pieces[0])
     found = {"lateral_mean": 0.29, "yaw_rate_mean": -0.98}
     monkeypatch.setattr(gait_metrics, "summary", lambda trace, speed, robot, dt: found)
-    monkeypatch.setattr(checkpoint, "load_policy", lambda path: random_policy)
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: random_policy)
     argv = ["p", "--speeds", "0", "0.5", "--seeds", "2", "--sideways", "0.3", "--turn", "-1"]
     assert sim2sim.main(argv) == 0
     expected = [[0, 0.3, -1], [0, 0.3, -1], [0.5, 0.3, -1], [0.5, 0.3, -1]]

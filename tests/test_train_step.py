@@ -7,9 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import networks, train_step
+from kslc_jax import checkpoint_format, networks, train_step
 from kslc_jax.config import preset
-from kslc_jax.training import checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +21,7 @@ def made():
 
 def leaves(state):
     """All leaves as numpy; keys as their data."""
-    return [checkpoint.host_array(x) for x in jax.tree.leaves(state)]
+    return [checkpoint_format.host_array(x) for x in jax.tree.leaves(state)]
 
 
 def assert_same(a, b):

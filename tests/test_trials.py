@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from kslc_jax import commands, curriculum, env, evaluate, networks, observations
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import gait_metrics, trials
-from kslc_jax.training import checkpoint
 
 DT = 0.01
 
@@ -23,7 +23,7 @@ def still():
     """A policy that asks for the default pose whatever it sees."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+    return policy_lib.Policy(config, params, curriculum.init(config), 0)
 
 
 @pytest.mark.parametrize("physics", [PhysicsConfig(engine="mujoco"), HighFidelity()])
@@ -283,7 +283,7 @@ def test_limbs_turn_with_the_body(xbot):
 
 def test_the_shipped_policy_walks_and_runs():
     """4 s, of which 2 s count: at 3 m/s it is still gathering speed."""
-    policy = checkpoint.load_policy("xbot_l_run")
+    policy = policy_lib.load_policy("xbot_l_run")
     args = evaluate.Args(Path("xbot_l_run"), speeds=(1.0, 3.0), seeds=1, seconds=4.0)
     walk, run = evaluate.sweep(args, policy)
     assert walk["survival"] == run["survival"] == 1.0

@@ -19,10 +19,10 @@ import orbax.checkpoint as ocp
 import pytest
 
 import kslc_jax.viewer
-from kslc_jax import config, curriculum, networks, play, robot
+from kslc_jax import config, curriculum, files, networks, play, robot
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import trials
-from kslc_jax.training import checkpoint
 from kslc_jax.viewer import session
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
@@ -37,7 +37,7 @@ def still():
     env = dataclasses.replace(base.env, reset_joint_noise=0.0)
     quiet = dataclasses.replace(base, env=env, physics=C_MUJOCO)
     params = jax.tree.map(np.zeros_like, networks.init(quiet, jax.random.key(0)))
-    return checkpoint.Policy(quiet, params, curriculum.init(quiet), 0)
+    return policy_lib.Policy(quiet, params, curriculum.init(quiet), 0)
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def run_dir(still, tmp_path_factory):
             items = ocp.args.Composite(
                 params=ocp.args.StandardSave(still.params), meta=ocp.args.JsonSave(meta)
             )
-            writer.save(root / checkpoint.FOLDER / step, args=items)
+            writer.save(root / files.CHECKPOINTS / step, args=items)
     return root
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from kslc_jax import commands, env, networks, observations, physics, signals
 from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.training.checkpoint import Policy
+from kslc_jax.policy import Policy
 
 NOMINAL = RandomizeConfig(
     friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0

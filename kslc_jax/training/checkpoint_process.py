@@ -17,12 +17,14 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
+from kslc_jax import policy as policy_lib
 from kslc_jax import runtime, train_step
+from kslc_jax.checkpoint_format import CheckpointError, host_array, typed
 from kslc_jax.config import Config
+from kslc_jax.policy import Policy
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
-from kslc_jax.training import checkpoint
-from kslc_jax.training.checkpoint import CheckpointError, Policy, Store, host_array, typed
+from kslc_jax.training.checkpoint import Store
 
 
 class Saves(Protocol):
@@ -43,12 +45,12 @@ class Disk:
         return Store(run_dir, config.run.keep)
 
     def save_policy(self, policy: Policy, folder: Path) -> None:
-        """As `checkpoint.save_policy`."""
-        checkpoint.save_policy(policy, folder)
+        """As `policy_lib.save_policy`."""
+        policy_lib.save_policy(policy, folder)
 
     def load_policy(self, path: Path) -> Policy:
-        """As `checkpoint.load_policy`."""
-        return checkpoint.load_policy(path)
+        """As `policy_lib.load_policy`."""
+        return policy_lib.load_policy(path)
 
     def close(self) -> None:
         """Lets go."""
@@ -114,7 +116,7 @@ def _on_host(policy: Policy) -> Policy:
 class _Server:
     """What the child does, by the name of what it is asked for."""
 
-    save_policy = staticmethod(checkpoint.save_policy)
+    save_policy = staticmethod(policy_lib.save_policy)
 
     def open(self, run_dir: Path, config: Config) -> None:
         self.store = Store(run_dir, config.run.keep)
@@ -135,7 +137,7 @@ class _Server:
         return jax.tree.map(host_array, state), warnings
 
     def load_policy(self, path: Path) -> Policy:
-        return _on_host(checkpoint.load_policy(path))
+        return _on_host(policy_lib.load_policy(path))
 
 
 def _serve(pipe: Connection) -> None:

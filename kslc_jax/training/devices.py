@@ -25,10 +25,10 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
 from kslc_jax import physics, train_step
+from kslc_jax.checkpoint_format import host_array, is_key, typed
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import Metrics, TrainState
-from kslc_jax.training.checkpoint import host_array, is_key, typed
 
 AXIS = "env"
 

@@ -20,7 +20,7 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from kslc_jax import physics, train_step
+from kslc_jax import files, physics, train_step
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.networks import Params
@@ -120,7 +120,7 @@ def train(
             lambda: stack.enter_context(_keeper(config, run_dir, resume, origin, progress, disk))
         )
         tracing = profiling.Profile(
-            run_dir / profiling.FOLDER,
+            run_dir / files.PROFILE,
             profile if devices.is_first() else 0,
             progress.say,
             progress.warn,

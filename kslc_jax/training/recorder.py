@@ -11,10 +11,13 @@ import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 
+from kslc_jax import files, policy
+from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import Config
+from kslc_jax.policy import Policy
 from kslc_jax.train_step import TrainState
 from kslc_jax.training import checkpoint
-from kslc_jax.training.checkpoint import BEST_METRIC, CheckpointError, Policy
+from kslc_jax.training.checkpoint import BEST_METRIC
 from kslc_jax.training.checkpoint_process import Saves
 from kslc_jax.training.logs import MetricsFile, Progress
 from kslc_jax.training.run_folder import writing
@@ -74,7 +77,7 @@ class Keeper(Onlooker):
         run_dir: Path,
         store: Saves,
         progress: Progress,
-        save_policy: Callable[[Policy, Path], None] = checkpoint.save_policy,
+        save_policy: Callable[[Policy, Path], None] = policy.save_policy,
     ):
         self._config, self._run_dir, self._store = config, run_dir, store
         self._progress, self._save_policy = progress, save_policy
@@ -122,13 +125,13 @@ class Keeper(Onlooker):
 
     def keep_snapshot(self, state: TrainState) -> None:
         """One that is there, from before a resume, stays."""
-        folder = self._run_dir / checkpoint.SNAPSHOTS / str(int(state.step))
+        folder = self._run_dir / files.SNAPSHOTS / str(int(state.step))
         with self._going_on():
             if not folder.exists():
                 self._save_policy(checkpoint.policy_of(self._config, state), folder)
 
     def drop_snapshots(self, after: int) -> None:
-        for folder in (self._run_dir / checkpoint.SNAPSHOTS).glob("[0-9]*"):
+        for folder in (self._run_dir / files.SNAPSHOTS).glob("[0-9]*"):
             if folder.name.isdigit() and int(folder.name) > after:
                 shutil.rmtree(folder, ignore_errors=True)
 

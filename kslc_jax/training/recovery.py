@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax import config as config_lib
-from kslc_jax import train_step
+from kslc_jax import files, train_step
+from kslc_jax.checkpoint_format import CheckpointError, host_array, typed
 from kslc_jax.config import Config
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
-from kslc_jax.training.checkpoint import CheckpointError, host_array, typed
 
 PATIENCE = 10
 """Train steps in a row without one finite update, after which a training goes back."""
@@ -32,9 +32,6 @@ ATTEMPTS = 3
 
 CAUTION = 0.5
 """Factor on the learning rate at each of them."""
-
-DUMP = "bad_state.npz"
-"""File in the run folder: the state before the first bad train step of the last attempt."""
 
 
 class NumbersError(RuntimeError):
@@ -114,7 +111,7 @@ def persist(
             attempt = attempt + 1 if int(state.step) == back_to else 1
             back_to = int(state.step)
             if attempt > ATTEMPTS:
-                left = _leave(config, run_dir / DUMP, bad.before)
+                left = _leave(config, run_dir / files.BAD_STATE, bad.before)
                 raise NumbersError(
                     f"{bad}, also after {ATTEMPTS} attempts from train step {back_to} with lower "
                     f"learning rates; {left}"

@@ -9,7 +9,7 @@ import viser
 from viser.uplot import Axis, Legend, Scale, Series
 
 from kslc_jax.config import CommandConfig
-from kslc_jax.training.checkpoint import Policy
+from kslc_jax.policy import Policy
 from kslc_jax.viewer.session import View
 
 MARGIN = 0.5

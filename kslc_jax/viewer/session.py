@@ -15,7 +15,7 @@ from kslc_jax.config import Config, PhysicsConfig
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.evaluation import trials
 from kslc_jax.networks import Params
-from kslc_jax.training.checkpoint import Policy
+from kslc_jax.policy import Policy
 
 FALLEN_SECONDS = 1.0
 """How long a fallen robot lies there before it starts anew."""
