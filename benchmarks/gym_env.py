@@ -13,7 +13,7 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from kslc_jax import observations, physics, robot
+from kslc_jax import motors, observations, robot
 from kslc_jax.config import NUM_JOINTS, Config
 from kslc_jax.gait import _LEG, SOLE_DROP, _pattern
 from kslc_jax.signals import CONTACT_FORCE
@@ -101,7 +101,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         """One control step of the physics towards the joint targets [16, rad]."""
         data, servos = self.data, self.model.actuator_biasprm
         for _ in range(self.config.physics.decimation):
-            self.torque, data.ctrl[:], servos[:, physics.SERVO_DAMPING] = physics.drive(
+            self.torque, data.ctrl[:], servos[:, motors.SERVO_DAMPING] = motors.drive(
                 self.robot, NominalMotors, data.qpos[7:], data.qvel[6:], target, np
             )
             mujoco.mj_step(self.model, data)

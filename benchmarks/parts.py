@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from benchmarks import throughput, timeline, timing
-from kslc_jax import networks, ppo, train_step
+from kslc_jax import networks, ppo, rollout, train_step
 from kslc_jax.config import Config, preset
 from kslc_jax.training import profiling
 
@@ -38,7 +38,7 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
 
     def roll(state):
         params, key = state.learner.params, state.key
-        return train_step.rollout(config, params, state.env, state.curriculum, key)
+        return rollout.collect(config, params, state.env, state.curriculum, key)
 
     def make_samples(state, envs, traj):
         last_value = networks.value(config, state.learner.params, envs.privileged_history)
@@ -50,8 +50,8 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
     def update_on_same_windows(state, traj, samples):
         rows = jnp.arange(config.minibatch_size)
         env = state.env
-        actor = train_step._windows(env.history, traj.frame, traj.age)(rows)
-        critic = train_step._windows(env.privileged_history, traj.privileged, traj.age)(rows)
+        actor = rollout.windows(env.history, traj.frame, traj.age)(rows)
+        critic = rollout.windows(env.privileged_history, traj.privileged, traj.age)(rows)
 
         def apply(params, _):
             return networks.policy(config, params, actor), networks.value(config, params, critic)

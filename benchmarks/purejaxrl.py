@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import networks, ppo, train_step
+from kslc_jax import networks, ppo, rollout, train_step
 from kslc_jax.config import Config
 from kslc_jax.ppo import Learner, Samples
 from kslc_jax.train_step import Metrics, TrainState
@@ -32,11 +32,11 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     params = state.learner.params
 
     def one(envs, key):
-        new, traj = train_step.control_step(config, params, envs, state.curriculum, key)
-        new, outcome = jax.vmap(train_step.contain)(new, traj.outcome)
+        new, traj = rollout.control_step(config, params, envs, state.curriculum, key)
+        new, outcome = jax.vmap(rollout.contain)(new, traj.outcome)
         return new, (traj.replace(outcome=outcome), envs.history, envs.privileged_history)
 
-    start = jax.vmap(train_step.usable)(state.env)
+    start = jax.vmap(rollout.usable)(state.env)
     keys = jax.random.split(key_roll, config.ppo.rollout_steps)
     envs, (traj, *seen) = jax.lax.scan(one, start, keys)
     last_value = networks.value(config, params, envs.privileged_history)

@@ -239,13 +239,13 @@ def _roller(config: Any) -> Callable[..., tuple[Any, Any, Any]]:
     masked anything."""
     import jax
 
-    from kslc_jax import train_step
+    from kslc_jax import rollout
 
     @jax.jit
     def one(state: Any, envs: Any, key: jax.Array) -> tuple[Any, Any, Any]:
         params, curriculum = state.learner.params, state.curriculum
-        raw, traj = train_step.control_step(config, params, envs, curriculum, key)
-        return jax.vmap(train_step.contain)(raw, traj.outcome)[0], raw, traj
+        raw, traj = rollout.control_step(config, params, envs, curriculum, key)
+        return jax.vmap(rollout.contain)(raw, traj.outcome)[0], raw, traj
 
     return one
 
@@ -255,9 +255,9 @@ def _first_in_rollout(roll: Callable[..., Any], config: Any, state: Any) -> list
     import jax
     import numpy as np
 
-    from kslc_jax import train_step
+    from kslc_jax import rollout, train_step
 
-    envs = jax.vmap(train_step.usable)(state.env)
+    envs = jax.vmap(rollout.usable)(state.env)
     keys = jax.random.split(train_step.step_keys(state)[0], config.ppo.rollout_steps)
     for t, key in enumerate(keys):
         envs, raw, traj = roll(state, envs, key)

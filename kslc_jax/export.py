@@ -71,7 +71,7 @@ class Args:
 
 def metadata(policy: Policy) -> dict[str, Any]:
     """What it takes to run the network, JSON-ready: SI units, joints in action order."""
-    from kslc_jax import commands, observations, physics
+    from kslc_jax import commands, motors, observations, physics
 
     config, robot = policy.config, physics.robot_for(policy.config.physics)
     held = robot.is_arm & (config.env.arms == "held")
@@ -86,7 +86,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
         "kd": robot.kd.tolist(),
         "effort_limit": robot.effort_limit.tolist(),
         "speed_limit": robot.speed_limit.tolist(),
-        "torque_knee": physics.TORQUE_KNEE,
+        "torque_knee": motors.TORQUE_KNEE,
         "action_scale": config.env.action_scale,
         "action_clip": config.env.action_clip,
         "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],

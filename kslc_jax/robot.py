@@ -89,7 +89,7 @@ def load(
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
     # A diverged simulation must show as NaN, not restart behind our back.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # Torque limits depend on joint speed and are applied in physics.motor_torque. The engine must
+    # Torque limits depend on joint speed and are applied in motors.motor_torque. The engine must
     # not clamp as well: C MuJoCo drops the implicit damping of a saturated actuator, MJX keeps it.
     model.actuator_forcelimited[:] = 0
     joints = model.actuator_trnid[:, 0]

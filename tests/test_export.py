@@ -20,9 +20,9 @@ from kslc_jax import (
     curriculum,
     env,
     export,
+    motors,
     networks,
     observations,
-    physics,
     randomize,
     robot,
 )
@@ -322,7 +322,7 @@ def test_motor_torque_is_the_packages(runner, symmetric, xbot):
     meta = runner.SimpleNamespace(**export.metadata(symmetric))
     np.testing.assert_allclose(
         runner.motor_torque(meta, target, q, dq),
-        physics.motor_torque(xbot, one, q, dq, target, np),
+        motors.motor_torque(xbot, one, q, dq, target, np),
         atol=1e-9,
     )
 

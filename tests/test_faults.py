@@ -20,7 +20,17 @@ import numpy as np
 import pytest
 from processes import METRICS
 
-from kslc_jax import checkpoint_format, doctor, files, physics, ppo, runtime, train, train_step
+from kslc_jax import (
+    checkpoint_format,
+    doctor,
+    files,
+    physics,
+    ppo,
+    rollout,
+    runtime,
+    train,
+    train_step,
+)
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import preset, to_dict
@@ -188,7 +198,7 @@ def training(state_at, tmp_path, monkeypatch):
 
             def __call__(self, state):
                 state = poison(state)
-                finite = train_step.finite(state.learner.params)
+                finite = rollout.finite(state.learner.params)
                 skipped = jnp.isinf(state.learner.learning_rate)
                 metrics = METRICS | {"finite": finite, "ppo/skipped": skipped}
                 return state.replace(step=state.step + 1), metrics

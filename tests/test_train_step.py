@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint_format, networks, train_step
+from kslc_jax import checkpoint_format, networks, rollout, train_step
 from kslc_jax.config import preset
 
 
@@ -88,7 +88,7 @@ def test_gathered_windows_equal_stacked_histories(made):
     curriculum = train_step.curriculum_lib.init(config)
     seen, state, frames, ages = [], envs, [], []
     step = jax.jit(
-        lambda e, k: train_step.rollout(
+        lambda e, k: rollout.collect(
             dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout_steps=1)),
             params,
             e,
@@ -102,7 +102,7 @@ def test_gathered_windows_equal_stacked_histories(made):
         ages.append(state.time)
         state = step(state, jax.random.key(i))
     assert any(bool(jnp.any(a == 0)) for a in ages), "some episode should have restarted"
-    gather = train_step._windows(envs.history, jnp.stack(frames), jnp.stack(ages))
+    gather = rollout.windows(envs.history, jnp.stack(frames), jnp.stack(ages))
     windows = gather(jnp.arange(8 * config.env.num_envs))
     stacked = jnp.stack(seen).reshape(windows.shape)
     np.testing.assert_array_equal(windows, stacked)
