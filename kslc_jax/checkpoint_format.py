@@ -25,6 +25,7 @@ from kslc_jax import config as config_lib
 from kslc_jax import files
 from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config
+from kslc_jax.errors import UserError
 
 SCHEMA_VERSION = 2
 """Of a checkpoint's items; raise it with every change of the tree of `TrainState`, and say below
@@ -34,7 +35,7 @@ OLDER_POLICIES = (1,)
 """Schemas of which only the policy is still read. 1: no ceiling of the learning rate."""
 
 
-class CheckpointError(RuntimeError):
+class CheckpointError(UserError):
     """A checkpoint that is missing, damaged or of another config; the message says which."""
 
 

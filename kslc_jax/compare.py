@@ -21,13 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from kslc_jax import cli, evaluate, files, plots
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, files, plots, runtime
 from kslc_jax.config import Config, ConfigError, Fidelity
 
 WIDTH = 200
@@ -283,14 +282,13 @@ def run_all(args: Args) -> tuple[list[str], list[str]]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()  # before JAX, whose own choice of what to say the children would inherit
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.compare")
-        if args.keep:
-            files.require_writable(args.keep / files.EVALUATION)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return cli.run(lambda: _compare(cli.parse("compare", Args, argv, __doc__)))
+
+
+def _compare(args: Args) -> int:
+    """Does it all and reports; the exit code."""
+    if args.keep:
+        files.require_writable(args.keep / files.EVALUATION)
     try:
         failed, refused = run_all(args)
     except KeyboardInterrupt:

@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import tyro
 
-from kslc_jax import __version__, files, runtime
+from kslc_jax import __version__, cli, files
 from kslc_jax.config import NUM_JOINTS, Config, ConfigError
+from kslc_jax.errors import UserError
 
 if TYPE_CHECKING:
     from kslc_jax.networks import Params, Parity
@@ -293,32 +294,35 @@ def compare(policy: Policy, path: Path, form: str) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.export")
-        from kslc_jax.checkpoint_format import CheckpointError
-        from kslc_jax.policy import load_policy, save_policy
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return cli.run(lambda: _export(cli.parse("export", Args, argv, __doc__)))
+
+
+def _export(args: Args) -> None:
+    """Writes the policy, and compares the file with it."""
+    from kslc_jax.policy import load_policy
+
     try:
         if args.chosen == "orbax":
             args.out.parent.mkdir(parents=True, exist_ok=True)
         else:
             files.require_writable(args.out)
         policy = load_policy(args.policy)
-        if args.chosen == "orbax":
-            save_policy(policy, args.out)
-        else:
-            args.out.write_bytes(WRITE[args.chosen](policy))
-        if args.chosen == "stablehlo":
-            files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
-        print(f"wrote {args.out}, train step {policy.step}")
-        print(compare(policy, args.out, args.chosen))
-    except (CheckpointError, ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+        _write(policy, args)
+    except OSError as error:
+        raise UserError(str(error)) from error
+    print(f"wrote {args.out}, train step {policy.step}")
+    print(compare(policy, args.out, args.chosen))
+
+
+def _write(policy: Policy, args: Args) -> None:
+    from kslc_jax.policy import save_policy
+
+    if args.chosen == "orbax":
+        save_policy(policy, args.out)
+    else:
+        args.out.write_bytes(WRITE[args.chosen](policy))
+    if args.chosen == "stablehlo":
+        files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
 
 
 if __name__ == "__main__":

@@ -18,8 +18,9 @@ from pathlib import Path
 
 import tyro
 
-from kslc_jax import files, runtime, sim2sim
+from kslc_jax import cli, files, runtime, sim2sim
 from kslc_jax.config import ConfigError, Fidelity, require_seed
+from kslc_jax.errors import MissingPackage
 
 FPS = 50
 
@@ -128,12 +129,12 @@ def caption(picture, text: str):
 
 
 def film_writer():
-    """The module imageio; ImportError that says what to install."""
+    """The module imageio; MissingPackage that says what to install."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401 (imageio would say less clearly that it is missing)
     except ImportError as error:
-        raise ImportError(f"films: {error} (pip install 'kslc_jax[video]')") from error
+        raise MissingPackage(f"films: {error} (pip install 'kslc_jax[video]')") from error
     return imageio
 
 
@@ -196,7 +197,7 @@ def watch(args: Args) -> None:
     try:
         from kslc_jax.viewer.app import Viewer
     except ImportError as error:
-        raise ImportError(f"the viewer: {error} (pip install 'kslc_jax[viewer]')") from error
+        raise MissingPackage(f"the viewer: {error} (pip install 'kslc_jax[viewer]')") from error
 
     if not is_local(args.host):
         print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
@@ -209,28 +210,18 @@ def watch(args: Args) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.play")
-        if not args.live:
-            from kslc_jax.viewer import render  # noqa: F401 (before anything that imports mujoco)
+    return cli.run(lambda: _play(cli.parse("play", Args, argv, __doc__)))
 
-            sim2sim.simulator(args.engine)  # what is not installed is told at once
-    except (ConfigError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    from kslc_jax.checkpoint_format import CheckpointError
+
+def _play(args: Args) -> None:
+    if args.live:
+        watch(args)
+        return
+    runtime.choose_gl()  # before anything that imports mujoco
+    sim2sim.simulator(args.engine)  # what is not installed is told at once
     from kslc_jax.policy import load_policy
 
-    try:
-        if args.live:
-            watch(args)
-        else:
-            draw(args, load_policy(args.policy))
-    except (CheckpointError, ConfigError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    draw(args, load_policy(args.policy))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -19,10 +20,10 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 
-from kslc_jax import files
-from kslc_jax.learning import Several
+from kslc_jax import cli, files
+from kslc_jax.cli import Paths
+from kslc_jax.errors import UserError
 
 Records = dict[str, np.ndarray]
 
@@ -280,7 +281,7 @@ class Training:
     """When the commanded-speed range grew, and the learning curve over environment steps: speed
     range, tracking, episode length, throughput."""
 
-    runs: Several
+    runs: Paths
     """Run folders or metrics.jsonl files."""
     out: Path = Path("learning_curve.png")
     """Where the figure goes."""
@@ -290,7 +291,7 @@ class Training:
 class Learning:
     """How each commanded speed was learnt: mean forward speed over environment steps."""
 
-    runs: Several
+    runs: Paths
     """Run folders in which kslc_jax.learning was run, or learning.json files; METHOD-seedN folders
     are put together by method."""
     out: Path = Path("learning.png")
@@ -301,7 +302,7 @@ class Learning:
 class Performance:
     """Speed, survival and fluctuations over the commanded speed; mean and range over seeds."""
 
-    evaluations: Several
+    evaluations: Paths
     """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
     out: Path = Path("performance.png")
     """Where the figure goes."""
@@ -311,7 +312,7 @@ class Performance:
 class Momentum:
     """Yaw angular momentum of arms, legs and whole body over the commanded speed."""
 
-    evaluations: Several
+    evaluations: Paths
     """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
     out: Path = Path("momentum.png")
     """Where the figure goes."""
@@ -341,21 +342,18 @@ def _training(args: Training) -> None:
     learning_curve(runs, args.out)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    args = tyro.cli(
-        Training | Learning | Performance | Momentum,
-        args=argv,
-        description=__doc__,
-        prog="python -m kslc_jax.plots",
-    )
+def _run(args: Training | Learning | Performance | Momentum) -> None:
     try:
         draw(args)
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        raise UserError(str(error)) from error
     print(f"wrote {args.out}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    kinds: Any = Training | Learning | Performance | Momentum
+    return cli.run(lambda: _run(cli.parse("plots", kinds, argv, __doc__)))
 
 
 if __name__ == "__main__":

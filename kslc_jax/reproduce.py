@@ -17,10 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from rich.progress import Progress
+from rich.table import Table
 
+from kslc_jax import cli, evaluate, files, runtime
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, files, runtime
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.evaluation.tables import console
 
 SHIPPED = "xbot_l_run"
 
@@ -112,10 +115,8 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     return {f"{speed:g}": steps for speed, steps, _ in plots.milestones(records)}
 
 
-def report(rows: list[Row], title: str):
-    """What was compared, as a rich table."""
-    from rich.table import Table
-
+def report(rows: list[Row], title: str) -> Table:
+    """What was compared."""
     out = Table(title=title, title_justify="left")
     for column in ("what", "published", "here", ""):
         out.add_column(column, justify="left" if column == "what" else "right")
@@ -126,8 +127,6 @@ def report(rows: list[Row], title: str):
 
 def repeat(args: Args) -> list[Row]:
     """Everything that was asked for; ConfigError, CheckpointError or RunError where it cannot."""
-    from rich.progress import Progress
-
     from kslc_jax.policy import POLICIES, load_policy
 
     policy = load_policy(args.policy)
@@ -142,7 +141,7 @@ def repeat(args: Args) -> list[Row]:
         noise=old.get("noise", False),
         seed=old.get("seed", 0),
     )
-    screen = evaluate.console()
+    screen = console()
     with Progress(console=screen, transient=True) as bar:
         task = bar.add_task("trying", total=1.0)
         new = evaluate.sweep(how, policy, lambda share: bar.update(task, completed=share))
@@ -159,25 +158,18 @@ def repeat(args: Args) -> list[Row]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    from kslc_jax.checkpoint_format import CheckpointError
-    from kslc_jax.training.recovery import NumbersError
-    from kslc_jax.training.run_folder import RunError
+    return cli.run(lambda: _compare(cli.parse("reproduce", Args, argv, __doc__)))
 
+
+def _compare(args: Args) -> int:
+    """The exit code: 1 where a number lies outside its band."""
+    if args.train:
+        runtime.require_good_jax()
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.reproduce")
-        if args.train:
-            runtime.require_good_jax()
         rows = repeat(args)
-    except Stopped as error:
-        print(error, file=sys.stderr)
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
         return 130
-    except NumbersError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except (CheckpointError, ConfigError, RunError, runtime.JaxError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     differing = [what for what, _, _, agrees in rows if not agrees]
     if differing:
         print(f"{len(differing)} of {len(rows)} numbers lie outside their band")

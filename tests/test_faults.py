@@ -668,7 +668,7 @@ class TestDoctor:
 
     def test_a_package_that_cannot_be_imported_is_no_traceback(self, monkeypatch, capsys):
         """The table is there for machines where JAX or orbax is broken."""
-        for name in ("jax", "orbax.checkpoint", "kslc_jax.training.checkpoint"):
+        for name in ("jax", "orbax.checkpoint", "kslc_jax.policy"):
             monkeypatch.setitem(sys.modules, name, None)
         monkeypatch.setattr(doctor, "CHECKS", (("jax", doctor.check_jax, "install another"),))
         assert doctor.main(["check"]) == 1

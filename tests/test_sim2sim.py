@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import kslc_jax.evaluation
-from kslc_jax import curriculum, env, evaluate, networks, randomize, robot, sim2sim
+from kslc_jax import curriculum, env, networks, randomize, robot, sim2sim
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
-from kslc_jax.evaluation import gait_metrics, trials
+from kslc_jax.evaluation import gait_metrics, measure, trials
 
 
 @pytest.fixture(scope="module")
@@ -126,10 +126,10 @@ def test_imu_offset_is_an_error_of_roll_and_pitch(random_policy, frozen):
 
 
 def test_a_sweep_too_large_for_memory_goes_speed_by_speed(random_policy, frozen, monkeypatch):
-    monkeypatch.setattr(evaluate, "MOST_SAMPLES", 1)
+    monkeypatch.setattr(measure, "MOST_SAMPLES", 1)
     shares = []
     setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=3.0)
-    rows = evaluate.measure(random_policy, setting, (0.0, 1.0), 1, progress=shares.append)
+    rows = measure.measure(random_policy, setting, (0.0, 1.0), 1, progress=shares.append)
     assert [row["command"] for row in rows] == [0.0, 1.0]
     np.testing.assert_allclose(shares, np.arange(1, 7) / 6)
 
@@ -137,13 +137,13 @@ def test_a_sweep_too_large_for_memory_goes_speed_by_speed(random_policy, frozen,
 def test_report(random_policy, monkeypatch, tmp_path, capsys):
     """One table per condition, a summary, and JSON that holds every row."""
 
-    def measure(policy, setting, speeds, seeds, seed, progress, beside):
-        assert beside == (0.0, 0.0)
+    def fake(policy, setting, speeds, seeds, seed, progress, vy, yaw_rate):
+        assert (vy, yaw_rate) == (0.0, 0.0)
         progress(1.0)
         extra = setting.randomize.base_mass[0]
         return [{"command": v, "survival": 0.5, "forward_mean": v - extra} for v in speeds]
 
-    monkeypatch.setattr(evaluate, "measure", measure)
+    monkeypatch.setattr(measure, "measure", fake)
     monkeypatch.setattr(policy_lib, "load_policy", lambda path: random_policy)
     out = tmp_path / "deep" / "out.json"
     argv = ["p", "--speeds", "1", "2", "--perturb", "payload=0.25", "--latency", "--json", str(out)]

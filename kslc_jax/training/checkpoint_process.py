@@ -142,7 +142,8 @@ class _Server:
 
 def _serve(pipe: Connection) -> None:
     """The child: answers until the other end is closed, be it by the other's death."""
-    runtime.prepare()
+    runtime.prepare(gl=False)
+    runtime.quiet()
     jax.config.update("jax_platforms", "cpu")  # the accelerator is the training's
     for number in (signal.SIGINT, signal.SIGTERM):  # a terminal sends them to both
         signal.signal(number, signal.SIG_IGN)

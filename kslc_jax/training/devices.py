@@ -27,6 +27,7 @@ from orbax.checkpoint import multihost
 from kslc_jax import physics, train_step
 from kslc_jax.checkpoint_format import host_array, is_key, typed
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import Metrics, TrainState
 
@@ -153,7 +154,7 @@ def make(
 # ------------------------------------------------------------------------------- several processes
 
 
-class Elsewhere(RuntimeError):
+class Elsewhere(UserError):
     """Another process gave up, and says why."""
 
 

@@ -18,6 +18,7 @@ from kslc_jax import config as config_lib
 from kslc_jax import files, train_step
 from kslc_jax.checkpoint_format import CheckpointError, host_array, typed
 from kslc_jax.config import Config
+from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
@@ -34,8 +35,10 @@ CAUTION = 0.5
 """Factor on the learning rate at each of them."""
 
 
-class NumbersError(RuntimeError):
+class NumbersError(UserError):
     """Numbers that go bad however often the training goes back."""
+
+    exit_code = 1
 
 
 class WentBad(Exception):

@@ -19,13 +19,14 @@ from kslc_jax import config as config_lib
 from kslc_jax import files
 from kslc_jax.checkpoint_format import has_checkpoints
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
 from kslc_jax.training.logs import rows_written
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-class RunError(RuntimeError):
+class RunError(UserError):
     """A run folder that cannot be used; the message says why and what to do."""
 
 
