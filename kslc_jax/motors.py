@@ -15,7 +15,7 @@ TORQUE_KNEE = 0.75
 SERVO_DAMPING = 2
 """Where -damping stands in a servo's `actuator_biasprm`."""
 
-IMPLICIT = 0.6
+THETA = 0.6
 """theta: share of a step's motor torque taken from its end. 1, backward Euler, brakes at 5 ms what
 moves freely at 1 ms; below 0.5 it is unstable."""
 
@@ -53,13 +53,13 @@ def motor_damping(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any = 
     its present `torque`.
 
     The engines take it implicitly: full torque would carry an unloaded shank by 20 rad/s in 5 ms.
-    It is `IMPLICIT` times the slope of the chord from the present speed to that at the end of the
+    It is `THETA` times the slope of the chord from the present speed to that at the end of the
     step, so that a joint alone moves by the theta-method.
     """
     change = _speed_ahead(robot, dynamics, q, dq, target, torque, xp) - dq
     change = xp.where(xp.abs(change) < LEAST_CHANGE, LEAST_CHANGE, change)
     then = motor_torque(robot, dynamics, q, dq + change, target, xp)
-    return IMPLICIT * (torque - then) / change
+    return THETA * (torque - then) / change
 
 
 def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
@@ -70,7 +70,7 @@ def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
     pieces are.
     """
     rate = robot.mj_model.opt.timestep / robot.joint_inertia
-    start, rate = dq + (1.0 - IMPLICIT) * rate * torque, IMPLICIT * rate
+    start, rate = dq + (1.0 - THETA) * rate * torque, THETA * rate
     gain, kd = dynamics.kp * robot.kp, dynamics.kd * robot.kd
     full = robot.effort_limit * dynamics.motor_strength
     slope = full / ((1.0 - TORQUE_KNEE) * robot.speed_limit)

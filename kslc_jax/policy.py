@@ -52,7 +52,7 @@ class Policy:
 
     def act(self, state: PolicyState, frame: jax.Array) -> tuple[PolicyState, jax.Array]:
         """Deterministic action [16] for the newest actor frame [59]."""
-        history = observations.push_history(state.history, frame)
+        history = observations.append_frame(state.history, frame)
         return PolicyState(history), self.act_on(history)
 
     def act_on(self, history: jax.Array) -> jax.Array:

@@ -120,7 +120,7 @@ def parse(argv: list[str]) -> Args:
         from kslc_jax.training import run_folder
 
         base = run_folder.read_config(known.run_dir)
-    else:  # also on resume: the runner names what the stored config has otherwise
+    else:  # also on resume: run_folder names what the stored config has otherwise
         base = config_lib.preset(known.preset or DEFAULT, tuple(known.without))
     args = cli.parse("train", Args, argv, __doc__, default=Args(config=base))
     if args.resume and args.start_from:

@@ -22,7 +22,7 @@ METRICS = dict.fromkeys(
     ],
     0.5,
 )
-"""As a train step gives them, as far as runner, keeper and progress read them."""
+"""As a train step gives them, as far as loop, recorder and progress read them."""
 
 
 def command(*args: Any, forced: int) -> dict[str, Any]:

@@ -271,7 +271,7 @@ class TestGoingBack:
 
     def test_cautious(self, state_at):
         state = state_at(3)
-        new = recovery.cautious(state, 2)
+        new = recovery.with_lower_rate(state, 2)
         assert new.learner.learning_rate == pytest.approx(0.25 * state.learner.learning_rate)
         assert new.learner.rate_ceiling == new.learner.learning_rate
         assert new.key != state.key and same(new.learner.params, state.learner.params)
@@ -279,7 +279,7 @@ class TestGoingBack:
     def test_caution_lasts(self, made):
         """The KL rule raises the lowered learning rate by 2 % a train step at most."""
         init, step = made
-        state = recovery.cautious(init(), 1)
+        state = recovery.with_lower_rate(init(), 1)
         low = float(state.learner.learning_rate)
         assert low == pytest.approx(0.5 * DEBUG.ppo.learning_rate)
         for i in range(1, 4):

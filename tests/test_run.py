@@ -178,7 +178,7 @@ def test_first_signal_asks_second_interrupts():
         assert stop.requested == "SIGINT"
         signal.raise_signal(signal.SIGTERM)  # the same wish, come by another way
         assert stop.requested == "SIGINT"
-        stop._since -= loop.ONE_WISH
+        stop._since -= loop.SAME_SIGNAL_SECONDS
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
 
@@ -191,7 +191,7 @@ def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
     policy_lib.save_policy(old, tmp_path / "p")
     init, _ = train_step.make(preset("debug"))
     begin, origin = loop._starting_from(
-        tmp_path / "p", preset("debug"), init, checkpoint_process.Disk(), None
+        tmp_path / "p", preset("debug"), init, checkpoint_process.LocalStorage(), None
     )
     state = begin()
     for a, b in zip(
@@ -262,14 +262,14 @@ def test_snapshots_are_spread_over_the_run(parts, due):
 
 
 def test_a_stop_where_a_snapshot_is_due_keeps_it(tmp_path, monkeypatch):
-    log = recorder.Keeper.log
+    log = recorder.Recorder.log
 
     def stopping(self, metrics, step, took):
         if step == 4:
             signal.raise_signal(signal.SIGTERM)
         return log(self, metrics, step, took)
 
-    monkeypatch.setattr(recorder.Keeper, "log", stopping)
+    monkeypatch.setattr(recorder.Recorder, "log", stopping)
     assert "stopped by SIGTERM at train step 4" in cli(
         *DEBUG, "--run-dir", tmp_path, "--run.snapshots", 4
     )

@@ -49,7 +49,7 @@ def test_commands_hold(still):
     for wanted in ([1.5, 0.0, 0.0], [0.5, -0.3, 0.0], [1.0, 0.0, 0.4]):
         state = env.reset(config, jax.random.key(1), still.curriculum)
         for _ in range(3):
-            state = trials.hold(config, state, jnp.array(wanted))
+            state = trials.with_command(config, state, jnp.array(wanted))
             state, _ = step(config, state, jnp.zeros(16), jax.random.key(2), still.curriculum)
             seen = state.history[-1, at] / np.array([2.0, 2.0, 1.0])
             np.testing.assert_allclose(seen, wanted, atol=0.01)  # what one step turns the robot
@@ -59,7 +59,7 @@ def test_commands_hold(still):
 def test_a_yaw_rate_never_turns_the_other_way(still, rate):
     """A rate of 3 rad/s would ask for a heading 6 rad ahead, which is 0.28 rad behind."""
     state = env.reset(still.config, jax.random.key(1), still.curriculum)
-    held = trials.hold(still.config, state, jnp.array([0.0, 0.0, rate]))
+    held = trials.with_command(still.config, state, jnp.array([0.0, 0.0, rate]))
     steered = commands.steer(still.config.command, held.command, jnp.zeros(()))
     assert float(steered.velocity[2]) == pytest.approx(np.clip(rate, -1.0, 1.0), abs=1e-5)
 

@@ -27,7 +27,7 @@ YOUNGER: dict[str, Any] = {
 }
 """Fields that older files of this version lack, with the values that give the numbers of then."""
 
-RETIRED = {"config.physics.clamp_joint_speed"}
+REMOVED_FIELDS = {"config.physics.clamp_joint_speed"}
 """Fields of older files that nothing reads any more."""
 
 
@@ -52,7 +52,7 @@ def _build(cls: Any, data: Any, where: str) -> Any:
     require(isinstance(data, dict), f"{where}: expected an object, got {type(data).__name__}")
     resolved = typing.get_type_hints(cls)
     hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
-    data = {n: value for n, value in data.items() if f"{where}.{n}" not in RETIRED}
+    data = {n: value for n, value in data.items() if f"{where}.{n}" not in REMOVED_FIELDS}
     unknown = set(data) - set(hints)
     require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
     absent = set(hints) - set(data)

@@ -1,4 +1,4 @@
-"""Who reads and writes checkpoints: this process, or, of several, a child of the first.
+"""Checkpoint I/O. With several processes, a child of process 0 does it.
 
 Orbax is part of JAX's cluster: each save and each restore waits for all processes in it, and where
 one fails alone the others wait for ever. So of several processes the first lets a child do it that
@@ -27,7 +27,7 @@ from kslc_jax.train_step import TrainState
 from kslc_jax.training.checkpoint import Store
 
 
-class Saves(Protocol):
+class CheckpointStore(Protocol):
     """What a `Store` does for a training."""
 
     def steps(self) -> list[int]: ...
@@ -37,10 +37,10 @@ class Saves(Protocol):
     def close(self) -> None: ...
 
 
-class Disk:
+class LocalStorage:
     """This process does it."""
 
-    def open(self, run_dir: Path, config: Config) -> Saves:
+    def open(self, run_dir: Path, config: Config) -> CheckpointStore:
         """The checkpoints of a run folder."""
         return Store(run_dir, config.run.keep)
 
@@ -56,7 +56,7 @@ class Disk:
         """Lets go."""
 
 
-class DiskProcess(Disk):
+class ChildProcessStorage(LocalStorage):
     """A child does it; what it meets is raised here."""
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ class DiskProcess(Disk):
         self._process.start()
         theirs.close()
 
-    def open(self, run_dir: Path, config: Config) -> Saves:
+    def open(self, run_dir: Path, config: Config) -> CheckpointStore:
         self._ask("open", run_dir, config)
         return self
 

@@ -54,7 +54,7 @@ def join(
       ConfigError: it is not to be.
     """
     with contextlib.suppress(AttributeError):  # older ones have no such switch
-        jax.config.update("jax_enable_preemption_service", False)  # SIGTERM is the runner's
+        jax.config.update("jax_enable_preemption_service", False)  # the loop handles SIGTERM
     try:
         jax.distributed.initialize(coordinator, processes, index)
     except (RuntimeError, ValueError, OSError) as error:

@@ -1,6 +1,6 @@
 """What the host keeps of a training: metrics, checkpoints, and policies on the way.
 
-Of several processes the first alone does; the others have an `Onlooker` in its place, so that the
+Of several processes only the first keeps anything; the others have a `NullRecorder`, so that the
 loop reads the same.
 """
 
@@ -18,14 +18,14 @@ from kslc_jax.policy import Policy
 from kslc_jax.train_step import TrainState
 from kslc_jax.training import checkpoint
 from kslc_jax.training.checkpoint import BEST_METRIC
-from kslc_jax.training.checkpoint_process import Saves
+from kslc_jax.training.checkpoint_process import CheckpointStore
 from kslc_jax.training.logs import MetricsFile, Progress
 from kslc_jax.training.run_folder import writing
 
 Record = dict[str, float]
 
 
-class Onlooker:
+class NullRecorder:
     """Keeps nothing."""
 
     def at(self, step: int) -> contextlib.AbstractContextManager[None]:
@@ -52,7 +52,7 @@ class Onlooker:
         """Writes a checkpoint in the background."""
 
     def keep_snapshot(self, state: TrainState) -> None:
-        """Saves the policy alone."""
+        """CheckpointStore the policy alone."""
 
     def drop_snapshots(self, after: int) -> None:
         """Removes policies of train steps that a training went back behind."""
@@ -64,7 +64,7 @@ class Onlooker:
         """Writes the last checkpoint and waits for it."""
 
 
-class Keeper(Onlooker):
+class Recorder(NullRecorder):
     """Keeps everything of one run folder, and shows it.
 
     A failed save must not end hours of training: it is told, and the next one tries again. Only
@@ -75,7 +75,7 @@ class Keeper(Onlooker):
         self,
         config: Config,
         run_dir: Path,
-        store: Saves,
+        store: CheckpointStore,
         progress: Progress,
         save_policy: Callable[[Policy, Path], None] = policy.save_policy,
     ):

@@ -61,7 +61,7 @@ def _advance(
     """One control step; the view of a step that ended in a fall is the last one before it."""
     qvel = memory.env.physics.qvel.at[:2].add(push)
     pushed = memory.env.replace(physics=memory.env.physics.replace(qvel=qvel))
-    before = trials.hold(config, pushed, command, memory.heading)
+    before = trials.with_command(config, pushed, command, memory.heading)
     action = Policy(config, params, curriculum, 0).act_on(before.history)
     after, outcome = env.step(config, before, action, jax.random.fold_in(key, count), curriculum)
     fallen = outcome.terminated
