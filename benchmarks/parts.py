@@ -42,7 +42,7 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
 
     def make_samples(state, envs, traj):
         last_value = networks.value(config, state.learner.params, envs.privileged_history)
-        return train_step._samples(config, traj, last_value)
+        return train_step.samples_of(config, traj, last_value)
 
     def update(state, traj, samples):
         return run_update(state, samples, train_step._observer(config, state.env, traj))

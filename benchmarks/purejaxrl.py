@@ -40,7 +40,7 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     keys = jax.random.split(key_roll, config.ppo.rollout_steps)
     envs, (traj, *seen) = jax.lax.scan(one, start, keys)
     last_value = networks.value(config, params, envs.privileged_history)
-    samples = train_step._samples(config, traj, last_value)
+    samples = train_step.samples_of(config, traj, last_value)
     advantage = ppo._normalise(samples.advantage, samples.valid)
     history, privileged = (x.reshape(-1, *x.shape[2:]) for x in seen)
     stored = (samples.replace(advantage=advantage), history, privileged)

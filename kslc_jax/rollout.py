@@ -3,17 +3,19 @@
 Numbers that are not finite are masked here, so that one broken environment costs its own sample.
 """
 
+import functools
 from collections.abc import Callable
 
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax import env, maths, networks
+from kslc_jax import env, maths, networks, physics
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Params
+from kslc_jax.physics import PhysicsState
 
 
 @flax.struct.dataclass
@@ -31,12 +33,17 @@ class Trajectory:
 
 
 def collect(
-    config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
+    config: Config,
+    params: Params,
+    envs: EnvState,
+    curriculum: Curriculum,
+    key: jax.Array,
+    simulate: Callable[..., PhysicsState] = physics.step,
 ) -> tuple[EnvState, Trajectory]:
-    """T control steps of N environments under the sampled policy."""
+    """T control steps of N environments under the sampled policy; `simulate` as in `env.step`."""
 
     def one(envs: EnvState, key: jax.Array) -> tuple[EnvState, Trajectory]:
-        new, traj = control_step(config, params, envs, curriculum, key)
+        new, traj = control_step(config, params, envs, curriculum, key, simulate)
         new, outcome = jax.vmap(contain)(new, traj.outcome)
         return new, traj.replace(outcome=outcome)
 
@@ -44,14 +51,20 @@ def collect(
 
 
 def control_step(
-    config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
+    config: Config,
+    params: Params,
+    envs: EnvState,
+    curriculum: Curriculum,
+    key: jax.Array,
+    simulate: Callable[..., PhysicsState] = physics.step,
 ) -> tuple[EnvState, Trajectory]:
     """One control step of N environments, as it comes out: a row of the trajectory, [N]."""
     key_act, key_env = jax.random.split(key)
     dist = networks.policy(config, params, envs.history)
     action = dist.sample(key_act)
     keys = jax.random.split(key_env, config.env.num_envs)
-    new, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(config, envs, action, keys, curriculum)
+    step = functools.partial(env.step, simulate=simulate)
+    new, outcome = jax.vmap(step, (None, 0, 0, 0, None))(config, envs, action, keys, curriculum)
     return new, Trajectory(
         action=action,
         mean=dist.mean,

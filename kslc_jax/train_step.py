@@ -95,7 +95,7 @@ def step(
     start = jax.vmap(usable)(state.env)
     envs, traj = collect(config, params, start, state.curriculum, key_roll)
     last_value = networks.value(config, params, envs.privileged_history)
-    samples = _samples(config, traj, last_value)
+    samples = samples_of(config, traj, last_value)
     apply = _observer(config, start, traj, spread)
     learner, losses = ppo.update(
         config.ppo, apply, drawn(config, state), state.learner, samples, key_update
@@ -123,7 +123,7 @@ def step_keys(state: TrainState) -> jax.Array:
     return jax.random.split(jax.random.fold_in(state.key, state.step))
 
 
-def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
+def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
     """Flattened PPO samples [T * N, ...] with advantages."""
     out = traj.outcome
     done = out.terminated | out.truncated

@@ -142,7 +142,7 @@ def test_metadata(symmetric, xbot):
     assert data["default_joint_pos"] == [0] * 16 and data["control_dt"] == 0.01
     assert data["action_scale"] == 0.25 and data["action_clip"] == 18
     assert data["history_length"] == 3 and data["observation_clip"] == 18
-    assert sum(c["width"] for c in data["frame"]) == 59
+    assert sum(c["width"] for c in data["frame"]) == observations.ACTOR_WIDTH
     assert data["frame"][1] == {"name": "command", "width": 3, "scale": (2, 2, 1)}
     assert data["gait"] == {
         "cycle_time": pytest.approx(CYCLE),

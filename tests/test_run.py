@@ -364,8 +364,8 @@ class TestErrors:
     def test_damaged_config(self, tmp_path, fails):
         (tmp_path / "config.json").write_text("{")
         assert "config.json is damaged" in fails("--resume", "--run-dir", tmp_path)
-        (tmp_path / "config.json").write_text('{"schema": 1, "seed": 0}')
-        assert "missing field" in fails("--resume", "--run-dir", tmp_path)
+        (tmp_path / "config.json").write_text('{"schema": 1, "seeds": 0}')
+        assert "unknown field seeds" in fails("--resume", "--run-dir", tmp_path)
 
     def test_all_checkpoints_gone(self, whole, tmp_path, fails):
         shutil.copytree(whole[0], tmp_path / "r")

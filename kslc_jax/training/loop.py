@@ -108,7 +108,7 @@ def train(
     """
     init, step = train_step.make(config) if mesh is None else devices.make(config, mesh)
     like = jax.eval_shape(init)
-    memory.check(config, like, 1 if mesh is None else mesh.size)
+    memory.check(config, 1 if mesh is None else mesh.size)
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(progress))
         storage = (
@@ -295,8 +295,7 @@ def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
     on = kind if jax.device_count() == 1 else f"{count} of {jax.device_count()} devices ({kind})"
     if devices.several():
         on += f", {jax.process_count()} processes"
-    like = jax.eval_shape(lambda: train_step.init(config, 0))
-    need = memory.estimate(config, like, count)
+    need = memory.estimate(config, count)
     return (
         f"{n} environments x {t} steps = {config.batch_size} samples an update, "
         f"{config.run.steps / 1e6:.2f}M steps in all; engine {engine} on {on}, about "

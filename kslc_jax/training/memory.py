@@ -1,19 +1,22 @@
-"""The memory of each device that a training takes: reckoned before it compiles, read off after.
+"""The memory that a training takes on each device: estimated before it compiles, measured after.
 
 A train step has two phases, of which the larger one counts. The rollout fills the trajectory and
 needs what one control step needs. The update keeps frames and samples, and adds a minibatch: its
-windows of frames, and what its networks keep for the gradient. Numbers are 32 bits wide. The
-constants below are read off XLA's buffer assignments; docs/performance.md compares.
+windows of frames, and what its networks keep for the gradient. Sizes of arrays come from the shapes
+of the program itself; the constants below are read off XLA's buffer assignments;
+docs/performance.md compares.
 """
 
-import dataclasses
+import functools
 import os
 from typing import Any
 
 import jax
 
-from kslc_jax import observations, physics
-from kslc_jax.config import NUM_JOINTS, Config, ConfigError
+from kslc_jax import physics, rollout, train_step
+from kslc_jax.config import Config, ConfigError
+from kslc_jax.ppo import Samples
+from kslc_jax.rollout import Trajectory
 from kslc_jax.train_step import TrainState
 
 NUMBER = 4
@@ -35,40 +38,48 @@ PROCESS = 2**30
 """Bytes of a process that trains on the CPU, before its first train step: Python, JAX, compiler."""
 
 
-def estimate(config: Config, like: TrainState, devices: int = 1) -> int:
-    """Bytes that the train step takes on each device. `like` has the shapes of the whole state."""
-    environments = _bytes(like.env) / devices
-    networks = _bytes(like.learner) + COPIES_OF_NETWORKS * _bytes(like.learner.params)
-    phases = _rollout(config, environments, devices), _update(config, devices)
-    return round(environments + networks + max(phases))
+def estimate(config: Config, devices: int = 1) -> int:
+    """Bytes that the train step takes on each device."""
+    state, trajectory, samples = shapes(config)
+    environments = _bytes(state.env) / devices
+    networks = _bytes(state.learner) + COPIES_OF_NETWORKS * _bytes(state.learner.params)
+    in_rollout = _rollout(config, trajectory, environments, devices)
+    in_update = _update(config, state, trajectory, samples, devices)
+    return round(environments + networks + max(in_rollout, in_update))
 
 
-def _rollout(config: Config, environments: float, devices: int) -> float:
+@functools.lru_cache(maxsize=8)
+def shapes(config: Config) -> tuple[TrainState, Trajectory, Samples]:
+    """Shapes of the state, of a rollout and of its samples. The physics, which takes long to trace
+    and changes no shape, is left out."""
+
+    def one() -> tuple[TrainState, Trajectory, Samples]:
+        state = train_step.init(config, 0)
+        args = state.learner.params, state.env, state.curriculum, state.key
+        _, trajectory = rollout.collect(config, *args, simulate=lambda _, state, *more: state)
+        samples = train_step.samples_of(config, trajectory, trajectory.value[-1])
+        return state, trajectory, samples
+
+    return jax.eval_shape(one)
+
+
+def _rollout(config: Config, trajectory: Trajectory, environments: float, devices: int) -> float:
     """Bytes of the trajectory and of one control step."""
-    n, t = config.env.num_envs / devices, config.ppo.rollout_steps
-    terms = len(dataclasses.fields(config.rewards.weights))
-    frame = observations.ACTOR_WIDTH + observations.CRITIC_WIDTH
-    trajectory = n * t * (frame + _sample() + terms)
-    mjx = n * MJX_STEP if physics.resolve_engine(config.physics) == "mjx" else 0
-    return NUMBER * trajectory + STATES_PER_STEP * environments + mjx
+    mjx = config.env.num_envs * MJX_STEP if physics.resolve_engine(config.physics) == "mjx" else 0
+    return (_bytes(trajectory) + mjx) / devices + STATES_PER_STEP * environments
 
 
-def _update(config: Config, devices: int) -> float:
+def _update(
+    config: Config, state: TrainState, trajectory: Trajectory, samples: Samples, devices: int
+) -> float:
     """Bytes of frames and samples, all of them on each device, and of a device's minibatch."""
-    env, network, t = config.env, config.network, config.ppo.rollout_steps
-    actor, critic = observations.ACTOR_WIDTH, observations.CRITIC_WIDTH
-    frames = (t + env.frames - 1) * actor + (t + env.privileged_frames - 1) * critic
-    window = env.frames * actor + env.privileged_frames * critic
-    inputs = window * (2 if network.symmetric else 1)  # and split into even and odd parts
-    kept = KEPT_PER_UNIT * (sum(network.actor) + sum(network.critic))
-    minibatch = config.minibatch_size / devices * (inputs + kept)
-    return NUMBER * (env.num_envs * frames + config.batch_size * _sample() + minibatch)
-
-
-def _sample() -> int:
-    """Numbers of a sample beside its observation: action, mean; index, log_prob, value, advantage,
-    target, valid."""
-    return 2 * NUM_JOINTS + 6
+    histories = state.env.history, state.env.privileged_history
+    before = sum(_bytes(history) * (1 - 1 / history.shape[1]) for history in histories)
+    frames = _bytes((trajectory.frame, trajectory.privileged)) + before
+    window = _bytes(histories) / config.env.num_envs
+    inputs = window * (2 if config.network.symmetric else 1)  # and split into even and odd parts
+    kept = NUMBER * KEPT_PER_UNIT * (sum(config.network.actor) + sum(config.network.critic))
+    return frames + _bytes(samples) + config.minibatch_size / devices * (inputs + kept)
 
 
 def _bytes(tree: Any) -> int:
@@ -90,12 +101,13 @@ def shown(size: float) -> str:
     return f"{number:.{1 if number < 10 else 0}f} {unit}"
 
 
-def check(config: Config, like: TrainState, devices: int = 1) -> None:
+def check(config: Config, devices: int = 1) -> None:
     """ConfigError where a training cannot fit into its devices' memory."""
     device = jax.local_devices()[0]
     memory = (device.memory_stats() or {}).get("bytes_limit")
-    before = _bytes(like.env) / devices + _bytes(like.learner)  # the loop keeps a copy
-    need = estimate(config, like, devices) + before
+    state, *_ = shapes(config)
+    before = _bytes(state.env) / devices + _bytes(state.learner)  # the loop keeps a copy
+    need = estimate(config, devices) + before
     if memory is None:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") - PROCESS
     if need > memory:
