@@ -59,8 +59,8 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
         return run_update(state, samples, apply)
 
     def run_update(state, samples, apply):
-        drawn = train_step.drawn(config, state)
-        return ppo.update(config.ppo, apply, drawn, state.learner, samples, state.key)
+        constants = train_step.rollout_constants(config, state)
+        return ppo.update(config.ppo, apply, constants, state.learner, samples, state.key)
 
     def program(fn: Callable, *args: Any) -> Callable[[], Any]:
         jitted = jax.jit(fn)

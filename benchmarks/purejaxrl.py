@@ -33,10 +33,10 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
 
     def one(envs, key):
         new, traj = rollout.control_step(config, params, envs, state.curriculum, key)
-        new, outcome = jax.vmap(rollout.contain)(new, traj.outcome)
+        new, outcome = jax.vmap(rollout.mask_broken)(new, traj.outcome)
         return new, (traj.replace(outcome=outcome), envs.history, envs.privileged_history)
 
-    start = jax.vmap(rollout.usable)(state.env)
+    start = jax.vmap(rollout.or_new_episode)(state.env)
     keys = jax.random.split(key_roll, config.ppo.rollout_steps)
     envs, (traj, *seen) = jax.lax.scan(one, start, keys)
     last_value = networks.value(config, params, envs.privileged_history)
@@ -55,7 +55,7 @@ def _update(
     config: Config, state: TrainState, stored: Stored, key: jax.Array
 ) -> tuple[Learner, Metrics]:
     """All epochs: shuffle everything, cut it, one gradient step on each piece."""
-    drawn = train_step.drawn(config, state)
+    constants = train_step.rollout_constants(config, state)
 
     def minibatch(learner: Learner, batch: Stored) -> tuple[Learner, Metrics]:
         samples, history, privileged = batch
@@ -64,7 +64,7 @@ def _update(
             dist = networks.policy(config, params, history)
             return dist, networks.value(config, params, privileged)
 
-        return ppo.gradient_step(config.ppo, apply, drawn, learner, samples)
+        return ppo.gradient_step(config.ppo, apply, constants, learner, samples)
 
     def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
         order = jax.random.permutation(key, config.batch_size)

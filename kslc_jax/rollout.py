@@ -44,7 +44,7 @@ def collect(
 
     def one(envs: EnvState, key: jax.Array) -> tuple[EnvState, Trajectory]:
         new, traj = control_step(config, params, envs, curriculum, key, simulate)
-        new, outcome = jax.vmap(contain)(new, traj.outcome)
+        new, outcome = jax.vmap(mask_broken)(new, traj.outcome)
         return new, traj.replace(outcome=outcome)
 
     return jax.lax.scan(one, envs, jax.random.split(key, config.ppo.rollout_steps))
@@ -86,7 +86,7 @@ def finite(tree: object) -> jax.Array:
     return jnp.dot(flags, jnp.ones_like(flags)) == len(leaves)
 
 
-def _blank(state: EnvState) -> EnvState:
+def broken_state(state: EnvState) -> EnvState:
     """A state without a number in it, whose physics is sure to break: `env.step` makes of it a new
     episode."""
     blank = jax.tree.map(jnp.zeros_like, state)
@@ -94,12 +94,12 @@ def _blank(state: EnvState) -> EnvState:
     return blank.replace(physics=physics)
 
 
-def usable(state: EnvState) -> EnvState:
+def or_new_episode(state: EnvState) -> EnvState:
     """The state of ONE environment, or a blank where a number in it is not finite."""
-    return maths.tree_where(finite(state), state, _blank(state))
+    return maths.tree_where(finite(state), state, broken_state(state))
 
 
-def contain(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
+def mask_broken(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
     """What a step of ONE environment gave. Where any number is not finite the step counts as
     broken: it is worth nothing, and a new episode follows."""
     whole = finite(state)
@@ -108,7 +108,7 @@ def contain(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
     nothing = jax.tree.map(jnp.zeros_like, out)
     nothing = nothing.replace(terminated=jnp.ones((), bool), broken=jnp.ones((), bool))
     return (
-        maths.tree_where(lost, _blank(state), state),
+        maths.tree_where(lost, broken_state(state), state),
         maths.tree_where(broken, nothing, out),
     )
 

@@ -18,11 +18,11 @@ from kslc_jax.config import Config, RunConfig
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Gaussian, Params
-from kslc_jax.ppo import Drawn, Learner, Samples
-from kslc_jax.rollout import Trajectory, collect, finite, usable, windows
+from kslc_jax.ppo import Learner, RolloutConstants, Samples
+from kslc_jax.rollout import Trajectory, collect, finite, or_new_episode, windows
 
 Metrics = dict[str, jax.Array]
-Spread = Callable[[jax.Array], jax.Array]
+ShardIndex = Callable[[jax.Array], jax.Array]
 
 
 @flax.struct.dataclass
@@ -80,25 +80,25 @@ def start_from(
         raise ValueError("networks of other shapes")
     # Copies, for a train step donates its state and another training may start from the same.
     learner = state.learner.replace(params=jax.tree.map(jnp.copy, params))
-    curriculum = curriculum_lib.taken_over(config, curriculum)
+    curriculum = curriculum_lib.inherit(config, curriculum)
     curriculum = jax.tree.map(lambda x, like: x.astype(like.dtype), curriculum, state.curriculum)
     return state.replace(learner=learner, curriculum=curriculum)
 
 
 def step(
-    config: Config, state: TrainState, spread: Spread = lambda index: index
+    config: Config, state: TrainState, shard_index: ShardIndex = lambda index: index
 ) -> tuple[TrainState, Metrics]:
-    """One rollout and one update; see the module's first line. `spread` places the indices of a
+    """One rollout and one update; see the module's first line. `shard_index` places the indices of a
     minibatch's samples where there are several devices."""
     key_roll, key_update = step_keys(state)
     params = state.learner.params
-    start = jax.vmap(usable)(state.env)
+    start = jax.vmap(or_new_episode)(state.env)
     envs, traj = collect(config, params, start, state.curriculum, key_roll)
     last_value = networks.value(config, params, envs.privileged_history)
     samples = samples_of(config, traj, last_value)
-    apply = _observer(config, start, traj, spread)
+    apply = _observer(config, start, traj, shard_index)
     learner, losses = ppo.update(
-        config.ppo, apply, drawn(config, state), state.learner, samples, key_update
+        config.ppo, apply, rollout_constants(config, state), state.learner, samples, key_update
     )
     progress = _progress(traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
@@ -106,7 +106,7 @@ def step(
     return new, _metrics(config, new, traj.outcome, progress, losses)
 
 
-def drawn(config: Config, state: TrainState) -> Drawn:
+def rollout_constants(config: Config, state: TrainState) -> RolloutConstants:
     """What the samples of the coming rollout share.
 
     With `ppo.entropy_fades` the entropy bonus falls with what is left to climb: a policy that is
@@ -114,8 +114,8 @@ def drawn(config: Config, state: TrainState) -> Drawn:
     """
     coef = jnp.asarray(config.ppo.entropy_coef, jnp.float32)
     if config.ppo.entropy_fades:
-        coef *= curriculum_lib.left(config.curriculum, state.curriculum)
-    return Drawn(networks.log_std(config, state.learner.params), coef)
+        coef *= curriculum_lib.remaining_share(config.curriculum, state.curriculum)
+    return RolloutConstants(networks.log_std(config, state.learner.params), coef)
 
 
 def step_keys(state: TrainState) -> jax.Array:
@@ -144,14 +144,14 @@ def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Sampl
 
 
 def _observer(
-    config: Config, start: EnvState, traj: Trajectory, spread: Spread = lambda index: index
-) -> ppo.Apply:
+    config: Config, start: EnvState, traj: Trajectory, shard_index: ShardIndex = lambda index: index
+) -> ppo.PolicyAtIndex:
     """The networks at the observations of `traj`, named by their flat index t * N + n."""
     actor = windows(start.history, traj.frame, traj.age)
     critic = windows(start.privileged_history, traj.privileged, traj.age)
 
     def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array]:
-        index = spread(index)
+        index = shard_index(index)
         dist = networks.policy(config, params, actor(index))
         return dist, networks.value(config, params, critic(index))
 

@@ -284,7 +284,7 @@ class TestGoingBack:
         assert low == pytest.approx(0.5 * DEBUG.ppo.learning_rate)
         for i in range(1, 4):
             state, metrics = step(state)
-            assert float(metrics["ppo/learning_rate"]) <= low * ppo.RELIEF**i * 1.00001
+            assert float(metrics["ppo/learning_rate"]) <= low * ppo.CEILING_GROWTH**i * 1.00001
 
     def test_replay_shows_where(self, made, tmp_path, capsys, monkeypatch):
         """A number that overflows in the first control step, in one environment."""

@@ -60,9 +60,9 @@ def test_entropy_bonus_fades_with_the_way_that_is_left(made, fades, v_max, coef)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, entropy_fades=fades))
     state = init()
     curriculum = state.curriculum.replace(v_max=jnp.asarray(v_max))
-    drawn = train_step.drawn(config, state.replace(curriculum=curriculum))
-    assert float(drawn.entropy_coef) == pytest.approx(coef)
-    np.testing.assert_allclose(jnp.exp(drawn.log_std), config.network.init_std, rtol=1e-6)
+    constants = train_step.rollout_constants(config, state.replace(curriculum=curriculum))
+    assert float(constants.entropy_coef) == pytest.approx(coef)
+    np.testing.assert_allclose(jnp.exp(constants.log_std), config.network.init_std, rtol=1e-6)
 
 
 def test_metrics_are_finite_and_named(made):
@@ -148,7 +148,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     broken from the start."""
     config, init, _ = made
 
-    def update(ppo_config, apply, drawn, learner, samples, key):
+    def update(ppo_config, apply, constants, learner, samples, key):
         return learner, {"samples": samples, "seen": apply(learner.params, samples.index)}
 
     monkeypatch.setattr(train_step.ppo, "update", update)

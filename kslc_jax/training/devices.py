@@ -135,12 +135,12 @@ def make(
 ) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
     """`train_step.make` over a mesh: (init, train_step), both jitted; train_step donates."""
 
-    def spread(index: jax.Array) -> jax.Array:
+    def shard_index(index: jax.Array) -> jax.Array:
         split = NamedSharding(mesh, PartitionSpec(AXIS))
         return jax.lax.with_sharding_constraint(index, split)
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        return train_step.step(config, state, spread)
+        return train_step.step(config, state, shard_index)
 
     placed = shardings(mesh, jax.eval_shape(lambda: train_step.init(config, 0)))
     everywhere: Any = NamedSharding(mesh, PartitionSpec())

@@ -69,14 +69,14 @@ def _roller(config: Config) -> Roll:
     def one(state: TrainState, envs: EnvState, key: jax.Array) -> Step:
         params, curriculum = state.learner.params, state.curriculum
         raw, traj = rollout.control_step(config, params, envs, curriculum, key)
-        return jax.vmap(rollout.contain)(raw, traj.outcome)[0], raw, traj
+        return jax.vmap(rollout.mask_broken)(raw, traj.outcome)[0], raw, traj
 
     return one
 
 
 def _first_in_rollout(roll: Roll, config: Config, state: TrainState) -> list[str]:
     """What goes bad in the first control step in which anything does, and in which environments."""
-    envs = jax.vmap(rollout.usable)(state.env)
+    envs = jax.vmap(rollout.or_new_episode)(state.env)
     keys = jax.random.split(train_step.step_keys(state)[0], config.ppo.rollout_steps)
     for t, key in enumerate(keys):
         envs, raw, traj = roll(state, envs, key)
