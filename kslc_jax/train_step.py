@@ -88,8 +88,8 @@ def start_from(
 def step(
     config: Config, state: TrainState, shard_index: ShardIndex = lambda index: index
 ) -> tuple[TrainState, Metrics]:
-    """One rollout and one update; see the module's first line. `shard_index` places the indices of a
-    minibatch's samples where there are several devices."""
+    """One rollout and one update; see the module's first line. `shard_index` places the indices of
+    a minibatch's samples where there are several devices."""
     key_roll, key_update = step_keys(state)
     params = state.learner.params
     start = jax.vmap(or_new_episode)(state.env)
