@@ -294,6 +294,20 @@ def test_caption_writes_into_the_corner():
     assert not written[100:].any() and not written[:, 320:].any()
 
 
+def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot):
+    from kslc_jax.viewer import render
+
+    def fails(*args, **kwargs):
+        raise render.RenderError("no GL")
+
+    monkeypatch.setattr(render, "_renderer", fails)
+    camera = robot.load("high").mj_model.vis.global_
+    before = camera.fovy
+    with pytest.raises(render.RenderError):
+        render.gait_strip(np.tile(xbot.default_qpos, (10, 1)), dt=0.1)
+    assert camera.fovy == before != render.LONG_LENS
+
+
 def test_video_carries_the_speeds(monkeypatch, tmp_path):
     """Two speeds of half a second each at 50 frames a second, with text, drawn without GL."""
     imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
