@@ -15,4 +15,4 @@ Each prints a table, and the first five keep the numbers with `--json`.
 
 from kslc_jax import runtime
 
-runtime.prepare()
+runtime.prepare(gl=False)

@@ -13,9 +13,9 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from kslc_jax import observations, physics, robot
+from kslc_jax import motors, observations, robot
 from kslc_jax.config import NUM_JOINTS, Config
-from kslc_jax.gait import _LEG, SOLE_DROP, _pattern
+from kslc_jax.gait import LEG, SOLE_DROP, pattern
 from kslc_jax.signals import CONTACT_FORCE
 
 Observation = dict[str, np.ndarray]
@@ -52,12 +52,12 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (NUM_JOINTS,))
         self._history = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
         self._scale = {
-            "policy": observations._row(observations.ACTOR, "scale"),
-            "critic": observations._row(observations.CRITIC, "scale"),
+            "policy": observations.row(observations.ACTOR, "scale"),
+            "critic": observations.row(observations.CRITIC, "scale"),
         }
-        noise = observations._row(observations.ACTOR, "noise") * self._scale["policy"]
+        noise = observations.row(observations.ACTOR, "noise") * self._scale["policy"]
         self._noise = config.env.noise_level * noise
-        self._legs = [_pattern(self.robot, side, _LEG) for side in ("left", "right")]
+        self._legs = [pattern(self.robot, side, LEG) for side in ("left", "right")]
         self._slices = {
             name: [self.robot.sensor(f"{side}_foot_{name}") for side in ("left", "right")]
             for name in ("pos", "touch")
@@ -101,7 +101,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         """One control step of the physics towards the joint targets [16, rad]."""
         data, servos = self.data, self.model.actuator_biasprm
         for _ in range(self.config.physics.decimation):
-            self.torque, data.ctrl[:], servos[:, physics.SERVO_DAMPING] = physics.drive(
+            self.torque, data.ctrl[:], servos[:, motors.SERVO_DAMPING] = motors.drive(
                 self.robot, NominalMotors, data.qpos[7:], data.qvel[6:], target, np
             )
             mujoco.mj_step(self.model, data)

@@ -42,13 +42,14 @@ def once(preset_name: str, num_envs: int, frames: int, repeats: int) -> dict[str
     import jax
 
     from benchmarks import throughput
-    from kslc_jax import memory, train_step
+    from kslc_jax import train_step
     from kslc_jax.config import preset
+    from kslc_jax.training import memory
 
     config = timing.resized(preset(preset_name), num_envs, frames)
     init, step = train_step.make(config)
     like = jax.eval_shape(init)
-    memory.check(config, like)
+    memory.check(config)
     before = _peak()
     compiled = step.lower(like).compile()
     run = {"training": throughput.stepping(init, compiled)}
@@ -58,7 +59,7 @@ def once(preset_name: str, num_envs: int, frames: int, repeats: int) -> dict[str
         "frames": frames,
         "before_mib": before / MIB,
         "peak_mib": _peak() / MIB,
-        "estimated_mib": memory.estimate(config, like) / MIB,
+        "estimated_mib": memory.estimate(config) / MIB,
         "planned_mib": (memory.measured(compiled) or 0) / MIB,
         "steps_per_second": config.batch_size / seconds,
     }

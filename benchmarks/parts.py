@@ -21,8 +21,9 @@ import numpy as np
 import tyro
 
 from benchmarks import throughput, timeline, timing
-from kslc_jax import networks, ppo, profiling, train_step
+from kslc_jax import networks, ppo, rollout, train_step
 from kslc_jax.config import Config, preset
+from kslc_jax.training import profiling
 
 matplotlib.use("Agg")
 
@@ -37,11 +38,11 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
 
     def roll(state):
         params, key = state.learner.params, state.key
-        return train_step.rollout(config, params, state.env, state.curriculum, key)
+        return rollout.collect(config, params, state.env, state.curriculum, key)
 
     def make_samples(state, envs, traj):
         last_value = networks.value(config, state.learner.params, envs.privileged_history)
-        return train_step._samples(config, traj, last_value)
+        return train_step.samples_of(config, traj, last_value)
 
     def update(state, traj, samples):
         return run_update(state, samples, train_step._observer(config, state.env, traj))
@@ -49,8 +50,8 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
     def update_on_same_windows(state, traj, samples):
         rows = jnp.arange(config.minibatch_size)
         env = state.env
-        actor = train_step._windows(env.history, traj.frame, traj.age)(rows)
-        critic = train_step._windows(env.privileged_history, traj.privileged, traj.age)(rows)
+        actor = rollout.windows(env.history, traj.frame, traj.age)(rows)
+        critic = rollout.windows(env.privileged_history, traj.privileged, traj.age)(rows)
 
         def apply(params, _):
             return networks.policy(config, params, actor), networks.value(config, params, critic)
@@ -58,8 +59,8 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
         return run_update(state, samples, apply)
 
     def run_update(state, samples, apply):
-        drawn = train_step.drawn(config, state)
-        return ppo.update(config.ppo, apply, drawn, state.learner, samples, state.key)
+        constants = train_step.rollout_constants(config, state)
+        return ppo.update(config.ppo, apply, constants, state.learner, samples, state.key)
 
     def program(fn: Callable, *args: Any) -> Callable[[], Any]:
         jitted = jax.jit(fn)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import networks, ppo, train_step
+from kslc_jax import networks, ppo, rollout, train_step
 from kslc_jax.config import Config
 from kslc_jax.ppo import Learner, Samples
 from kslc_jax.train_step import Metrics, TrainState
@@ -32,15 +32,15 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     params = state.learner.params
 
     def one(envs, key):
-        new, traj = train_step.control_step(config, params, envs, state.curriculum, key)
-        new, outcome = jax.vmap(train_step.contain)(new, traj.outcome)
+        new, traj = rollout.control_step(config, params, envs, state.curriculum, key)
+        new, outcome = jax.vmap(rollout.mask_broken)(new, traj.outcome)
         return new, (traj.replace(outcome=outcome), envs.history, envs.privileged_history)
 
-    start = jax.vmap(train_step.usable)(state.env)
+    start = jax.vmap(rollout.or_new_episode)(state.env)
     keys = jax.random.split(key_roll, config.ppo.rollout_steps)
     envs, (traj, *seen) = jax.lax.scan(one, start, keys)
     last_value = networks.value(config, params, envs.privileged_history)
-    samples = train_step._samples(config, traj, last_value)
+    samples = train_step.samples_of(config, traj, last_value)
     advantage = ppo._normalise(samples.advantage, samples.valid)
     history, privileged = (x.reshape(-1, *x.shape[2:]) for x in seen)
     stored = (samples.replace(advantage=advantage), history, privileged)
@@ -55,7 +55,7 @@ def _update(
     config: Config, state: TrainState, stored: Stored, key: jax.Array
 ) -> tuple[Learner, Metrics]:
     """All epochs: shuffle everything, cut it, one gradient step on each piece."""
-    drawn = train_step.drawn(config, state)
+    constants = train_step.rollout_constants(config, state)
 
     def minibatch(learner: Learner, batch: Stored) -> tuple[Learner, Metrics]:
         samples, history, privileged = batch
@@ -64,7 +64,7 @@ def _update(
             dist = networks.policy(config, params, history)
             return dist, networks.value(config, params, privileged)
 
-        return ppo.gradient_step(config.ppo, apply, drawn, learner, samples)
+        return ppo.gradient_step(config.ppo, apply, constants, learner, samples)
 
     def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:
         order = jax.random.permutation(key, config.batch_size)

@@ -15,6 +15,7 @@ import tyro
 
 from benchmarks import timing
 from kslc_jax import physics, train_step
+from kslc_jax import rollout as rollout_lib
 from kslc_jax.config import NUM_JOINTS, Config, preset
 
 
@@ -41,7 +42,7 @@ def rollout(config: Config) -> Callable[[], Any]:
 
     def one(state):
         params, key = state.learner.params, state.key
-        return train_step.rollout(config, params, state.env, state.curriculum, key)
+        return rollout_lib.collect(config, params, state.env, state.curriculum, key)
 
     run = jax.jit(one)
     return lambda: jax.block_until_ready(run(state))

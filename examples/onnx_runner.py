@@ -98,7 +98,7 @@ if __name__ == "__main__":
     args = parser.parse_args()
     if not Path(args.policy).is_file():
         parser.error(f"no file '{args.policy}'")
-    xbot_l = Path(__file__).resolve().parents[1] / "kslc_jax" / "assets" / "xbot_l.xml"
+    xbot_l = Path(__file__).resolve().parents[1] / "kslc_jax" / "robots" / "xbot_l.xml"
     model, controller = mujoco.MjModel.from_xml_path(str(xbot_l)), Controller(args.policy, args.vx)
     model.opt.timestep = 0.001  # at 5 ms the motors alone cannot hold a shank to its speed limit
     track, dt = simulate(controller, model, args.seconds), controller.meta.control_dt

@@ -8,7 +8,7 @@ __version__ = "0.1.0"
 def __getattr__(name: str) -> Any:
     """`load_policy` and `Policy` on first use, so that importing the package stays cheap."""
     if name in ("load_policy", "Policy"):
-        from kslc_jax import checkpoint
+        from kslc_jax import policy
 
-        return getattr(checkpoint, name)
+        return getattr(policy, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

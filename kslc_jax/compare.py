@@ -21,17 +21,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from kslc_jax import cli, evaluate, files, plots
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, files, plots, runtime
 from kslc_jax.config import Config, ConfigError, Fidelity
-from kslc_jax.learning import LEARNING
-from kslc_jax.logs import METRICS
-from kslc_jax.plots import EVALUATION
 
 WIDTH = 200
 """Columns of the table, whatever the terminal has: to be copied, not torn."""
@@ -107,7 +103,7 @@ def jobs(args: Args) -> Iterator[Job]:
 
 
 def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
-    from kslc_jax.checkpoint import has_checkpoints
+    from kslc_jax.checkpoint_format import has_checkpoints
 
     folder = args.out / f"{variant}-seed{seed}"
     preset = args.baseline if variant == "baseline" else args.preset
@@ -121,24 +117,24 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     run = ("--run-dir", str(folder), *length, *resume)
     speeds = ("--speeds", *map(str, args.speeds))
     trials = ("--seeds", str(args.trials), "--fidelity", args.fidelity)
-    kept = ("--json", str(folder / EVALUATION))
+    kept = ("--json", str(folder / files.EVALUATION))
     evaluation = (str(folder), *speeds, *trials, *kept)
     return Job(variant, seed, folder, config, (*what, *run), evaluation)
 
 
 def require_ours(job: Job) -> None:
     """ConfigError or RunError where the folder holds a training of something else."""
-    from kslc_jax import run_folder
+    from kslc_jax.training import run_folder
 
-    if (job.folder / run_folder.CONFIG).exists():
+    if (job.folder / files.CONFIG).exists():
         run_folder.difference(run_folder.read_config(job.folder), job.config)
 
 
 def run(job: Job, steps: int) -> bool:
     """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
     a process of its own, whose memory and compiled programs are gone with it."""
-    if trained(job.folder) < steps or not (job.folder / LEARNING).exists():
-        for name in (EVALUATION, LEARNING):
+    if trained(job.folder) < steps or not (job.folder / files.LEARNING).exists():
+        for name in (files.EVALUATION, files.LEARNING):
             (job.folder / name).unlink(missing_ok=True)  # not of what is trained now
         # A training that was stopped by a signal has saved, and says that all is well.
         if not (call("train", job.train) and trained(job.folder) >= steps):
@@ -159,7 +155,7 @@ def trained(run: Path) -> int:
 def is_done(job: Job, args: Args) -> bool:
     """Whether the folder holds the evaluation that is asked for, of a training of that length."""
     try:
-        kept = json.loads((job.folder / EVALUATION).read_text())
+        kept = json.loads((job.folder / files.EVALUATION).read_text())
         speeds = tuple(row["command"] for row in kept["rows"])
         how = (kept["fidelity"], kept["seeds"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -194,27 +190,25 @@ def finished(out: Path) -> list[Path]:
         variant, _, _ = run.name.rpartition("-seed")
         return (VARIANTS.index(variant) if variant in VARIANTS else len(VARIANTS)), run.name
 
-    return sorted((path.parent for path in out.glob(f"*/{EVALUATION}")), key=place)
+    return sorted((path.parent for path in out.glob(f"*/{files.EVALUATION}")), key=place)
 
 
 def keep(run: Path, folder: Path) -> None:
     """Copies a finished run's config, versions and evaluation, and what `plots` reads of its
     learning curves and of its metrics: every tenth record, and those at which the range of commands
     grew."""
-    from kslc_jax.run_folder import CONFIG, VERSIONS
-
     folder.mkdir(parents=True, exist_ok=True)
-    for name in (CONFIG, VERSIONS, EVALUATION):
-        files.write_whole(folder / name, (run / name).read_text())
-    learnt = json.loads((run / LEARNING).read_text())
+    for name in (files.CONFIG, files.VERSIONS, files.EVALUATION):
+        files.write_atomically(folder / name, (run / name).read_text())
+    learnt = json.loads((run / files.LEARNING).read_text())
     for point in learnt["points"]:
         point["rows"] = [{n: _short(row[n]) for n in plots.LEARNT} for row in point["rows"]]
-    files.write_whole(folder / LEARNING, json.dumps(learnt))
+    files.write_atomically(folder / files.LEARNING, json.dumps(learnt))
     records = plots.read_metrics(run)
     count = len(records["env_steps"])
     kept = sorted({*range(0, count, 10), *plots.growth(records), count - 1})
     rows = ({name: _short(records[name][i]) for name in plots.COLUMNS} for i in kept)
-    files.write_whole(folder / METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
+    files.write_atomically(folder / files.METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
 
 
 def _short(x: float) -> float:
@@ -237,7 +231,7 @@ def table(runs: Sequence[Path]) -> Table:
 
 
 def _speeds(run: Path) -> dict[float, str]:
-    rows = json.loads((run / EVALUATION).read_text())["rows"]
+    rows = json.loads((run / files.EVALUATION).read_text())["rows"]
     return {
         row["command"]: f"{row['forward_mean']:.2f}" if row["survival"] == 1.0 else "falls"
         for row in rows
@@ -265,7 +259,7 @@ def report(args: Args, refused: Sequence[str]) -> None:
 
 def run_all(args: Args) -> tuple[list[str], list[str]]:
     """Does what is not done before; the names of what failed, and of what is something else."""
-    from kslc_jax.run_folder import RunError
+    from kslc_jax.training.run_folder import RunError
 
     failed, refused = [], []
     todo = list(jobs(args))
@@ -288,14 +282,13 @@ def run_all(args: Args) -> tuple[list[str], list[str]]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()  # before JAX, whose own choice of what to say the children would inherit
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.compare")
-        if args.keep:
-            files.require_writable(args.keep / EVALUATION)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return cli.run(lambda: _compare(cli.parse("compare", Args, argv, __doc__)))
+
+
+def _compare(args: Args) -> int:
+    """Does it all and reports; the exit code."""
+    if args.keep:
+        files.require_writable(args.keep / files.EVALUATION)
     try:
         failed, refused = run_all(args)
     except KeyboardInterrupt:

@@ -59,7 +59,7 @@ def init(config: Config) -> Curriculum:
     )
 
 
-def taken_over(config: Config, other: Curriculum) -> Curriculum:
+def inherit(config: Config, other: Curriculum) -> Curriculum:
     """How far another training's curriculum had got, within the limits of this one's; what is left
     out here (an ablation) stays at its start."""
     own, limits = init(config), config.curriculum
@@ -90,7 +90,7 @@ def top_falls(state: Curriculum) -> jax.Array:
     return state.top_falls / jnp.maximum(state.top_minutes, 1e-6)
 
 
-def left(config: CurriculumConfig, state: Curriculum) -> jax.Array:
+def remaining_share(config: CurriculumConfig, state: Curriculum) -> jax.Array:
     """Share [] of the way from `v_start` to `v_limit` that is still ahead; 1 if there is none."""
     way = config.v_limit - config.v_start
     return (config.v_limit - state.v_max) / way if way > 0.0 else jnp.ones(())

@@ -19,8 +19,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 import tyro
+from rich.console import Console
+from rich.table import Table
 
-from kslc_jax import runtime
+from kslc_jax import cli, runtime
 from kslc_jax.config import ConfigError, PhysicsConfig
 
 PYTHONS = ((3, 11), (3, 13))
@@ -54,9 +56,6 @@ class Replay:
     def __post_init__(self):
         if self.steps < 1:
             raise ConfigError("steps must be at least 1")
-
-
-# ------------------------------------------------------------------------------------------ check
 
 
 def check_python() -> str:
@@ -120,7 +119,8 @@ def _joint_angles(engine: Literal["mujoco", "mjx"]):
 def check_renderer() -> str:
     """A picture can be drawn; in a process of its own, for GL is chosen before mujoco starts."""
     code = (
-        "from kslc_jax import render, robot; import os;"
+        "from kslc_jax import runtime; runtime.prepare();"
+        "from kslc_jax import robot; from kslc_jax.viewer import render; import os;"
         "next(render.frames(robot.load('high').default_qpos[None])); print(os.environ['MUJOCO_GL'])"
     )
     done = subprocess.run(
@@ -167,9 +167,6 @@ CHECKS: tuple[tuple[str, Callable[[], str], str], ...] = (
 
 def check() -> int:
     """Prints the table; 1 if a check failed."""
-    from rich.console import Console
-    from rich.table import Table
-
     table = Table(title="kslc_jax on this machine", title_justify="left")
     for column in ("check", "result", "found", "fix"):
         table.add_column(column, overflow="fold")
@@ -184,124 +181,19 @@ def check() -> int:
     return 1 if failed else 0
 
 
-# ----------------------------------------------------------------------------------------- replay
-
-
-def bad_leaves(tree: Any) -> dict[str, Any]:
-    """Where (as an array of bools) the numbers of a tree are not finite, by name."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    found = {}
-    for path, leaf in jax.tree.leaves_with_path(tree):
-        if jnp.issubdtype(leaf.dtype, jnp.floating):
-            bad = ~np.isfinite(np.asarray(leaf))
-            if bad.any():
-                found[jax.tree_util.keystr(path, simple=True, separator=".")] = bad
-    return found
-
-
-def replay(args: Replay) -> int:
-    """Prints what goes bad in the first train step in which anything does."""
-    from kslc_jax import recovery, train_step
-
-    config, state = recovery.read_dump(args.dump)
-    _, step = train_step.make(config)
-    roll = _roller(config)
-    for _ in range(args.steps):
-        number = int(state.step) + 1
-        said = [f"before: {_count(name, bad)}" for name, bad in bad_leaves(_parts(state)).items()]
-        said += _first_in_rollout(roll, config, state)
-        state, metrics = step(state)
-        after = {**_parts(state), "metrics": metrics}
-        said += [f"after: {_count(name, bad)}" for name, bad in bad_leaves(after).items()]
-        if said:
-            print(f"train step {number} is the first with a number that is not finite:")
-            print("\n".join(f"  {line}" for line in said))
-            return 0
-        print(f"train step {number}: all finite, {float(metrics['ppo/skipped']):.0%} skipped")
-    return 0
-
-
-def _parts(state: Any) -> dict[str, Any]:
-    """What a train step goes from and to."""
-    return {"learner": state.learner, "curriculum": state.curriculum, "env": state.env}
-
-
-def _count(name: str, bad: Any) -> str:
-    return f"{name}, {int(bad.sum())} of {bad.size}"
-
-
-def _roller(config: Any) -> Callable[..., tuple[Any, Any, Any]]:
-    """One control step (state, envs, key): envs as training goes on with, and what was before it
-    masked anything."""
-    import jax
-
-    from kslc_jax import train_step
-
-    @jax.jit
-    def one(state: Any, envs: Any, key: jax.Array) -> tuple[Any, Any, Any]:
-        params, curriculum = state.learner.params, state.curriculum
-        raw, traj = train_step.control_step(config, params, envs, curriculum, key)
-        return jax.vmap(train_step.contain)(raw, traj.outcome)[0], raw, traj
-
-    return one
-
-
-def _first_in_rollout(roll: Callable[..., Any], config: Any, state: Any) -> list[str]:
-    """What goes bad in the first control step in which anything does, and in which environments."""
-    import jax
-    import numpy as np
-
-    from kslc_jax import train_step
-
-    envs = jax.vmap(train_step.usable)(state.env)
-    keys = jax.random.split(train_step.step_keys(state)[0], config.ppo.rollout_steps)
-    for t, key in enumerate(keys):
-        envs, raw, traj = roll(state, envs, key)
-        rows = {
-            name: bad.reshape(len(bad), -1).any(1)
-            for name, bad in bad_leaves({"rollout": traj, "env": raw}).items()
-        }
-        broken = np.asarray(traj.outcome.broken)
-        if broken.any():
-            rows["physics diverged"] = broken
-        if rows:
-            where = f"control step {t + 1} of {len(keys)}"
-            return [f"{where}: {name}, environments {_some(bad)}" for name, bad in rows.items()]
-    return []
-
-
-def _some(bad: Any, shown: int = 5) -> str:
-    """The first few indices of True."""
-    indices = bad.nonzero()[0]
-    more = f" and {len(indices) - shown} more" if len(indices) > shown else ""
-    return ", ".join(map(str, indices[:shown])) + more
-
-
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    try:
-        args = tyro.cli(
-            Check | Replay,
-            args=argv,
-            default=Check(),
-            description=__doc__,
-            prog="python -m kslc_jax.doctor",
-        )
-        if isinstance(args, Check):
-            return check()
-        from kslc_jax.checkpoint import CheckpointError
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    try:
-        return replay(args)
-    except (CheckpointError, ConfigError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    kinds: Any = Check | Replay
+    return cli.run(lambda: _run(cli.parse("doctor", kinds, argv, __doc__, default=Check())))
+
+
+def _run(args: Check | Replay) -> int:
+    if isinstance(args, Check):
+        return check()
+    from kslc_jax.training.replay import replay
+
+    replay(args.dump, args.steps)
+    return 0
 
 
 if __name__ == "__main__":

@@ -267,6 +267,6 @@ def _observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> E
     frame = observations.actor_frame(config.env, src, key)
     privileged = observations.critic_frame(config.env, src)
     return state.replace(
-        history=observations.push_history(state.history, frame),
-        privileged_history=observations.push_history(state.privileged_history, privileged),
+        history=observations.append_frame(state.history, frame),
+        privileged_history=observations.append_frame(state.privileged_history, privileged),
     )

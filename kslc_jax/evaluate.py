@@ -9,42 +9,20 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
+from rich.progress import Progress
 
-from kslc_jax import files, runtime
+from kslc_jax import cli, files
 from kslc_jax.config import ConfigError, Fidelity, require_seed
+from kslc_jax.evaluation.tables import Row, console, table
 
-HEADLINE = (
-    ("survival", "survived", "{:.0%}"),
-    ("forward_mean", "mean vx [m/s]", "{:.2f}"),
-    ("forward_mean_ci", "+-", "{:.2f}"),
-    ("forward_std", "vx std", "{:.2f}"),
-    ("lateral_std", "vy std", "{:.2f}"),
-    ("yaw_rate_std", "yaw std", "{:.2f}"),
-    ("stride_frequency", "strides/s", "{:.2f}"),
-    ("flight_share", "flight", "{:.0%}"),
-    ("clearance", "clearance [m]", "{:.3f}"),
-    ("shoulder_hip_correlation", "arm-leg corr", "{:.2f}"),
-    ("stance_difference", "L-R stance", "{:.0%}"),
-    ("within_speed_limits", "in speed limits", "{:.1%}"),
-    ("cost_of_transport", "CoT", "{:.2f}"),
-    ("momentum_yaw_rms", "Lz rms", "{:.2f}"),
-)
-
-ASIDE = (
-    *HEADLINE[:3],
-    ("lateral_mean", "mean vy [m/s]", "{:.2f}"),
-    ("yaw_rate_mean", "mean yaw rate [rad/s]", "{:.2f}"),
-    *HEADLINE[3:],
-)
-"""The same where a side step or a turn is asked for, too: they follow the mean forward speed."""
-
-MOST_SAMPLES = 2_000_000
-"""Control steps of all trials whose traces are held in memory at once, about 300 bytes each."""
+if TYPE_CHECKING:
+    from kslc_jax.policy import Policy
 
 SHORTEST = 3.0
 """Seconds below which nothing is left of a trial after the time to gather speed."""
@@ -89,101 +67,26 @@ def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
         raise ConfigError(f"seconds must be a whole number from {SHORTEST:g} to {LONGEST:g}")
 
 
-def measure(
-    policy,
-    setting,
-    speeds,
-    seeds: int,
-    seed: int = 0,
-    progress=lambda share: None,
-    describe=None,
-    beside: tuple[float, float] = (0.0, 0.0),
-) -> list[dict[str, float]]:
-    """One row of metrics per commanded forward speed [m/s], over `seeds` trials each.
-
-    Args:
-      policy: who is tried.
-      setting: conditions, a `trials.Setting`.
-      speeds: commands.
-      seeds: trials per command.
-      seed: of initial states and randomisation.
-      progress: told the share that is done.
-      describe: the metrics of a trace; None: all of them, `gait_metrics.summary`.
-      beside: side step [m/s, to the left] and turn [rad/s, to the left] commanded with every speed.
-    """
-    import jax
-    import numpy as np
-
-    from kslc_jax import gait_metrics, physics, trials
-
-    describe = describe or gait_metrics.summary
-    robot, dt = physics.robot_for(setting.physics), setting.physics.control_dt
-    at_once = max(1, MOST_SAMPLES // (seeds * round(setting.seconds / dt)))
-    rows = []
-    for start in range(0, len(speeds), at_once):
-        group = speeds[start : start + at_once]
-        velocities = np.array([(speed, *beside) for speed in group for _ in range(seeds)])
-        pieces = []
-        for piece in trials.run(policy, setting, velocities, seed):
-            pieces.append(piece)
-            done = len(pieces) / round(setting.seconds)
-            progress((start + done * len(group)) / len(speeds))
-        for i, speed in enumerate(group):
-            mine = slice(i * seeds, (i + 1) * seeds)
-            part = [jax.tree.map(lambda x, mine=mine: x[:, mine], piece) for piece in pieces]
-            numbers = describe(trials.join(part), speed, robot, dt)
-            rows.append({"command": speed} | numbers)
-    return rows
-
-
-def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, float]]:
+def sweep(
+    args: Args, policy: "Policy", progress: Callable[[float], None] = lambda share: None
+) -> list[Row]:
     """One row of metrics per commanded speed."""
-    from kslc_jax import trials
+    from kslc_jax.evaluation import trials
+    from kslc_jax.evaluation.measure import measure
 
     engine = trials.engine(policy, args.fidelity)
     setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
     return measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
 
 
-def table(rows: list[dict[str, float]], title: str, columns=HEADLINE):
-    """The numbers of those columns as a rich table."""
-    from rich.table import Table
-
-    out = Table(title=title, title_justify="left")
-    out.add_column("command [m/s]", justify="right")
-    for _, label, _ in columns:
-        out.add_column(label, justify="right")
-    for row in rows:
-        cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
-        out.add_row(f"{row['command']:.1f}", *cells)
-    return out
-
-
-def console():
-    """A rich console as wide as the terminal, or where there is none as wide as the table."""
-    from rich.console import Console
-
-    return Console(highlight=False, width=None if sys.stdout.isatty() else 180)
-
-
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    from kslc_jax.checkpoint import CheckpointError
-
-    try:
-        _report(tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.evaluate"))
-    except (CheckpointError, ConfigError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return cli.run(lambda: _report(cli.parse("evaluate", Args, argv, __doc__)))
 
 
 def _report(args: Args) -> None:
     """Tries the policy, prints the table, keeps the numbers."""
-    from rich.progress import Progress
-
-    from kslc_jax.checkpoint import load_policy
+    from kslc_jax.policy import load_policy
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)

@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 import tyro
 
-from kslc_jax import __version__, files, runtime
+from kslc_jax import __version__, cli, files
 from kslc_jax.config import NUM_JOINTS, Config, ConfigError
+from kslc_jax.errors import UserError
 
 if TYPE_CHECKING:
-    from kslc_jax.checkpoint import Policy
     from kslc_jax.networks import Params, Parity
+    from kslc_jax.policy import Policy
 
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
@@ -71,7 +72,7 @@ class Args:
 
 def metadata(policy: Policy) -> dict[str, Any]:
     """What it takes to run the network, JSON-ready: SI units, joints in action order."""
-    from kslc_jax import commands, observations, physics
+    from kslc_jax import commands, motors, observations, physics
 
     config, robot = policy.config, physics.robot_for(policy.config.physics)
     held = robot.is_arm & (config.env.arms == "held")
@@ -86,7 +87,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
         "kd": robot.kd.tolist(),
         "effort_limit": robot.effort_limit.tolist(),
         "speed_limit": robot.speed_limit.tolist(),
-        "torque_knee": physics.TORQUE_KNEE,
+        "torque_knee": motors.TORQUE_KNEE,
         "action_scale": config.env.action_scale,
         "action_clip": config.env.action_clip,
         "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],
@@ -250,7 +251,7 @@ def read_orbax(path: Path) -> Network:
     """The network of a policy folder."""
     import jax
 
-    from kslc_jax.checkpoint import load_policy
+    from kslc_jax.policy import load_policy
 
     act = jax.jit(jax.vmap(load_policy(path).act_on))
     return lambda histories: np.asarray(act(histories))
@@ -266,7 +267,8 @@ def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
     """Histories [SAMPLES, K, 59] that the policy meets following commands of its own range."""
     import jax
 
-    from kslc_jax import env, trials
+    from kslc_jax import env
+    from kslc_jax.evaluation import trials
 
     config = trials.trial_config(policy.config, trials.Setting(policy.config.physics), robots)
 
@@ -316,31 +318,35 @@ def compare(policy: Policy, path: Path, form: str) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.export")
-        from kslc_jax.checkpoint import CheckpointError, load_policy, save_policy
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return cli.run(lambda: _export(cli.parse("export", Args, argv, __doc__)))
+
+
+def _export(args: Args) -> None:
+    """Writes the policy, and compares the file with it."""
+    from kslc_jax.policy import load_policy
+
     try:
         if args.chosen == "orbax":
             args.out.parent.mkdir(parents=True, exist_ok=True)
         else:
             files.require_writable(args.out)
         policy = load_policy(args.policy)
-        if args.chosen == "orbax":
-            save_policy(policy, args.out)
-        else:
-            args.out.write_bytes(WRITE[args.chosen](policy))
-        if args.chosen == "stablehlo":
-            files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
-        print(f"wrote {args.out}, train step {policy.step}")
-        print(compare(policy, args.out, args.chosen))
-    except (CheckpointError, ConfigError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+        _write(policy, args)
+    except OSError as error:
+        raise UserError(str(error)) from error
+    print(f"wrote {args.out}, train step {policy.step}")
+    print(compare(policy, args.out, args.chosen))
+
+
+def _write(policy: Policy, args: Args) -> None:
+    from kslc_jax.policy import save_policy
+
+    if args.chosen == "orbax":
+        save_policy(policy, args.out)
+    else:
+        args.out.write_bytes(WRITE[args.chosen](policy))
+    if args.chosen == "stablehlo":
+        files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
 
 
 if __name__ == "__main__":

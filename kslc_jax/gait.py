@@ -17,7 +17,7 @@ SOLE_DROP = 0.05
 # swing, of the elbow bend. Signs follow the joint axes: a negative left leg_pitch and knee swing
 # that leg forward and bend it; a positive left shoulder_pitch swings that arm back. The right side
 # has mirrored axes.
-_LEG = {"leg_pitch": 1.0, "knee": 2.0, "ankle_pitch": 1.0}
+LEG = {"leg_pitch": 1.0, "knee": 2.0, "ankle_pitch": 1.0}
 _HIP = {"leg_pitch": 1.0}
 _ARM = {"shoulder_pitch": 1.0}
 _ELBOW = {"elbow_pitch": 1.0}
@@ -138,18 +138,18 @@ def reference_pose(
     swing = jnp.where(jnp.abs(s) < config.double_support, 0.0, s)
     leg = config.reference_scale * (1.0 + config.reference_speed_gain * share)
     pose = leg * (
-        _pattern(robot, "left", _LEG) * jnp.minimum(swing, 0.0)
-        + _pattern(robot, "right", _LEG) * jnp.maximum(swing, 0.0)
+        pattern(robot, "left", LEG) * jnp.minimum(swing, 0.0)
+        + pattern(robot, "right", LEG) * jnp.maximum(swing, 0.0)
     )
-    hips = _pattern(robot, "left", _HIP) + _pattern(robot, "right", _HIP)
-    arms = _pattern(robot, "left", _ARM) + _pattern(robot, "right", _ARM)
-    elbows = _pattern(robot, "left", _ELBOW) - _pattern(robot, "right", _ELBOW)
+    hips = pattern(robot, "left", _HIP) + pattern(robot, "right", _HIP)
+    arms = pattern(robot, "left", _ARM) + pattern(robot, "right", _ARM)
+    elbows = pattern(robot, "left", _ELBOW) - pattern(robot, "right", _ELBOW)
     swing_of_arms = config.arm_swing_slow + share * (config.arm_swing - config.arm_swing_slow)
     sweep = c * (swing_of_arms * arms - share * config.stride_sweep * hips)
     return pose + sweep + share * config.elbow_bend * elbows
 
 
-def _pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:
+def pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:
     """[16] with each named joint's share on one side, zero elsewhere."""
     values = np.zeros(len(robot.joint_names))
     for joint, share in shares.items():

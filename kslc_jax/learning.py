@@ -10,30 +10,23 @@ Examples:
 """
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import tyro
+from rich.progress import Progress
 
-from kslc_jax import evaluate, files, runtime
+from kslc_jax import cli, evaluate, files
+from kslc_jax.cli import Paths
 from kslc_jax.config import ConfigError
-
-LEARNING = "learning.json"
-"""The file's name in a run folder."""
-
-Several = Annotated[
-    tyro.conf.Positional[tuple[Path, ...]],
-    tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="(at least one)"),
-]
-"""Paths on a command line; that there is one is for the command to check."""
 
 
 @dataclass(frozen=True)
 class Args:
     """What to try."""
 
-    runs: Several
+    runs: Paths
     """Run folders."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
     """Commanded forward speeds [m/s]."""
@@ -50,9 +43,7 @@ class Args:
 
 def snapshots(run: Path) -> list[Path]:
     """The policies that a run kept, oldest first; ConfigError where there is none."""
-    from kslc_jax.checkpoint import SNAPSHOTS
-
-    found = sorted((p for p in run.glob(f"{SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
+    found = sorted((p for p in run.glob(f"{files.SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
     if not found:
         raise ConfigError(f"{run} holds no snapshots (trained with --run.snapshots 0?)")
     return found
@@ -62,16 +53,20 @@ def _step(folder: Path) -> int:
     return int(folder.name)
 
 
-def curve(run: Path, args: Args, progress=lambda share: None) -> dict[str, Any]:
+def curve(
+    run: Path, args: Args, progress: Callable[[float], None] = lambda share: None
+) -> dict[str, Any]:
     """The content of learning.json: per snapshot, the speeds' survival and tracking."""
-    from kslc_jax import checkpoint, gait_metrics, trials
+    from kslc_jax.evaluation import gait_metrics, trials
+    from kslc_jax.evaluation.measure import measure
+    from kslc_jax.policy import load_policy
 
     points = []
     folders = snapshots(run)
     for i, folder in enumerate(folders):
-        policy = checkpoint.load_policy(folder)
+        policy = load_policy(folder)
         setting = trials.Setting(policy.config.physics, seconds=args.seconds)
-        rows = evaluate.measure(
+        rows = measure(
             policy,
             setting,
             args.speeds,
@@ -90,25 +85,19 @@ def curve(run: Path, args: Args, progress=lambda share: None) -> dict[str, Any]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    from rich.progress import Progress
+    return cli.run(lambda: _write(cli.parse("learning", Args, argv, __doc__)))
 
-    from kslc_jax.checkpoint import CheckpointError
 
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.learning")
+def _write(args: Args) -> None:
+    """Tries the policies of every run and writes what it found into the run folders."""
+    for run in args.runs:
+        snapshots(run)
+    with Progress(transient=True) as bar:
         for run in args.runs:
-            snapshots(run)
-        with Progress(transient=True) as bar:
-            for run in args.runs:
-                task = bar.add_task(str(run), total=1.0)
-                found = curve(run, args, lambda done, task=task: bar.update(task, completed=done))
-                files.write_json(run / LEARNING, found)
-                bar.console.print(f"wrote {run / LEARNING}")
-    except (CheckpointError, ConfigError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+            task = bar.add_task(str(run), total=1.0)
+            found = curve(run, args, lambda done, task=task: bar.update(task, completed=done))
+            files.write_json(run / files.LEARNING, found)
+            bar.console.print(f"wrote {run / files.LEARNING}")
 
 
 if __name__ == "__main__":

@@ -84,7 +84,7 @@ def slices(table: tuple[Component, ...]) -> dict[str, slice]:
     return {c.name: slice(int(e) - c.width, int(e)) for c, e in zip(table, ends, strict=True)}
 
 
-def _row(table: tuple[Component, ...], field: str) -> np.ndarray:
+def row(table: tuple[Component, ...], field: str) -> np.ndarray:
     parts = [np.broadcast_to(getattr(c, field), (c.width,)) for c in table]
     return np.concatenate(parts).astype(np.float32)
 
@@ -127,14 +127,14 @@ def _values(src: Sources) -> dict[str, jax.Array]:
 
 def _frame(table: tuple[Component, ...], src: Sources) -> jax.Array:
     values = _values(src)
-    return jnp.concatenate([values[c.name] for c in table]) * _row(table, "scale")
+    return jnp.concatenate([values[c.name] for c in table]) * row(table, "scale")
 
 
 def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
     """Noisy actor frame [59]; noise is scaled with its component, as in HG."""
     frame = _frame(ACTOR, src)
     level = config.noise_level * src.dynamics.noise
-    scale = level * _row(ACTOR, "noise") * _row(ACTOR, "scale")
+    scale = level * row(ACTOR, "noise") * row(ACTOR, "scale")
     frame = frame + scale * jax.random.normal(key, frame.shape)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 
@@ -148,7 +148,7 @@ def critic_frame(config: EnvConfig, src: Sources) -> jax.Array:
 # ---------------------------------------------------------------------------------------- history
 
 
-def push_history(history: jax.Array, frame: jax.Array) -> jax.Array:
+def append_frame(history: jax.Array, frame: jax.Array) -> jax.Array:
     """Appends `frame` [W] to `history` [K, W], oldest first."""
     return jnp.concatenate([history[1:], frame[None]])
 

@@ -18,8 +18,9 @@ from pathlib import Path
 
 import tyro
 
-from kslc_jax import files, runtime, sim2sim
+from kslc_jax import cli, files, runtime, sim2sim
 from kslc_jax.config import ConfigError, Fidelity, require_seed
+from kslc_jax.errors import MissingPackage
 
 FPS = 50
 
@@ -85,7 +86,7 @@ def record(args: Args, policy, settle: float = 4.0):
     import jax
     import numpy as np
 
-    from kslc_jax import trials
+    from kslc_jax.evaluation import trials
 
     velocities = np.zeros((len(args.speeds), 3))
     velocities[:, 0] = args.speeds
@@ -128,18 +129,18 @@ def caption(picture, text: str):
 
 
 def film_writer():
-    """The module imageio; ImportError that says what to install."""
+    """The module imageio; MissingPackage that says what to install."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401 (imageio would say less clearly that it is missing)
     except ImportError as error:
-        raise ImportError(f"films: {error} (pip install 'kslc_jax[video]')") from error
+        raise MissingPackage(f"films: {error} (pip install 'kslc_jax[video]')") from error
     return imageio
 
 
 def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
     """Films the speeds one after the other at real time, commanded and actual speed written in."""
-    from kslc_jax import render
+    from kslc_jax.viewer import render
 
     imageio = film_writer()
 
@@ -160,7 +161,7 @@ def draw(args: Args, policy) -> None:
     """Writes the gait strip and the video that were asked for."""
     import matplotlib.image
 
-    from kslc_jax import render
+    from kslc_jax.viewer import render
 
     for path in (args.gait_strip, args.video):
         files.require_writable(path)
@@ -194,9 +195,9 @@ def is_local(host: str) -> bool:
 def watch(args: Args) -> None:
     """Serves the viewer until Ctrl-C."""
     try:
-        from kslc_jax.viewer import Viewer
+        from kslc_jax.viewer.app import Viewer
     except ImportError as error:
-        raise ImportError(f"the viewer: {error} (pip install 'kslc_jax[viewer]')") from error
+        raise MissingPackage(f"the viewer: {error} (pip install 'kslc_jax[viewer]')") from error
 
     if not is_local(args.host):
         print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
@@ -209,27 +210,18 @@ def watch(args: Args) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.play")
-        if not args.live:
-            from kslc_jax import render  # noqa: F401 (before anything that imports mujoco)
+    return cli.run(lambda: _play(cli.parse("play", Args, argv, __doc__)))
 
-            sim2sim.simulator(args.engine)  # what is not installed is told at once
-    except (ConfigError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    from kslc_jax.checkpoint import CheckpointError, load_policy
 
-    try:
-        if args.live:
-            watch(args)
-        else:
-            draw(args, load_policy(args.policy))
-    except (CheckpointError, ConfigError, ImportError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+def _play(args: Args) -> None:
+    if args.live:
+        watch(args)
+        return
+    runtime.choose_gl()  # before anything that imports mujoco
+    sim2sim.simulator(args.engine)  # what is not installed is told at once
+    from kslc_jax.policy import load_policy
+
+    draw(args, load_policy(args.policy))
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -19,10 +20,10 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
-import tyro
 
-from kslc_jax.learning import LEARNING, Several
-from kslc_jax.logs import METRICS
+from kslc_jax import cli, files
+from kslc_jax.cli import Paths
+from kslc_jax.errors import UserError
 
 Records = dict[str, np.ndarray]
 
@@ -39,9 +40,6 @@ COLUMNS = ("env_steps", "seconds", *(name for name, _, _ in PANELS))
 
 LEARNT = ("command", "survival", "forward_mean")
 """What the rows of a learning.json have to hold."""
-
-EVALUATION = "evaluation.json"
-"""What `compare` calls an evaluation in a run folder."""
 
 PERFORMANCE: tuple[tuple[str, str], ...] = (
     ("forward_mean", "mean forward speed [m/s]"),
@@ -60,9 +58,9 @@ MOMENTUM: tuple[tuple[str, str], ...] = (
 
 def read_metrics(path: Path) -> Records:
     """Columns of a metrics.jsonl, or of the one in a run folder; ValueError if there is none."""
-    path = path / METRICS if path.is_dir() else path
+    path = path / files.METRICS if path.is_dir() else path
     if not path.is_file():
-        raise ValueError(f"no {METRICS} at {path}")
+        raise ValueError(f"no {files.METRICS} at {path}")
     try:
         rows = [json.loads(line) for line in path.read_text().splitlines()]
         records = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
@@ -126,7 +124,7 @@ def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, flo
             _ = [float(row["command"]) for row in rows]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is no evaluation (of evaluate or sim2sim --json)") from error
-        name = path.resolve().parent.name if path.name == EVALUATION else path.stem
+        name = path.resolve().parent.name if path.name == files.EVALUATION else path.stem
         found.setdefault(_method(name), []).append(rows)
     for name, seeds in found.items():
         if len({tuple(row["command"] for row in rows) for rows in seeds}) > 1:
@@ -152,7 +150,7 @@ def read_learning(paths: Sequence[Path]) -> dict[str, list[Curve]]:
     seeds of its method have; ValueError where they do not fit together."""
     found: dict[str, list[Curve]] = {}
     for path in paths:
-        file = path / LEARNING if path.is_dir() else path
+        file = path / files.LEARNING if path.is_dir() else path
         try:
             content = json.loads(file.read_text())
             found.setdefault(_method(content["run"]), []).append(_curve(content["points"]))
@@ -283,7 +281,7 @@ class Training:
     """When the commanded-speed range grew, and the learning curve over environment steps: speed
     range, tracking, episode length, throughput."""
 
-    runs: Several
+    runs: Paths
     """Run folders or metrics.jsonl files."""
     out: Path = Path("learning_curve.png")
     """Where the figure goes."""
@@ -293,7 +291,7 @@ class Training:
 class Learning:
     """How each commanded speed was learnt: mean forward speed over environment steps."""
 
-    runs: Several
+    runs: Paths
     """Run folders in which kslc_jax.learning was run, or learning.json files; METHOD-seedN folders
     are put together by method."""
     out: Path = Path("learning.png")
@@ -304,7 +302,7 @@ class Learning:
 class Performance:
     """Speed, survival and fluctuations over the commanded speed; mean and range over seeds."""
 
-    evaluations: Several
+    evaluations: Paths
     """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
     out: Path = Path("performance.png")
     """Where the figure goes."""
@@ -314,7 +312,7 @@ class Performance:
 class Momentum:
     """Yaw angular momentum of arms, legs and whole body over the commanded speed."""
 
-    evaluations: Several
+    evaluations: Paths
     """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
     out: Path = Path("momentum.png")
     """Where the figure goes."""
@@ -344,21 +342,18 @@ def _training(args: Training) -> None:
     learning_curve(runs, args.out)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    args = tyro.cli(
-        Training | Learning | Performance | Momentum,
-        args=argv,
-        description=__doc__,
-        prog="python -m kslc_jax.plots",
-    )
+def _run(args: Training | Learning | Performance | Momentum) -> None:
     try:
         draw(args)
     except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        raise UserError(str(error)) from error
     print(f"wrote {args.out}")
-    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    kinds: Any = Training | Learning | Performance | Momentum
+    return cli.run(lambda: _run(cli.parse("plots", kinds, argv, __doc__)))
 
 
 if __name__ == "__main__":

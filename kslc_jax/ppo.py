@@ -27,7 +27,7 @@ class Learner:
 class Samples:
     """What PPO needs of each step of a rollout, [T, N, ...] or any leading axes."""
 
-    index: jax.Array  # [] int, names the observation for `Apply`
+    index: jax.Array  # [] int, names the observation for `PolicyAtIndex`
     action: jax.Array  # [16]
     mean: jax.Array  # [16] of the policy that acted
     log_prob: jax.Array  # [] of the action under it
@@ -38,17 +38,17 @@ class Samples:
 
 
 @flax.struct.dataclass
-class Drawn:
+class RolloutConstants:
     """What all samples of a rollout share."""
 
     log_std: jax.Array  # [16] of the policy that acted
     entropy_coef: jax.Array  # [] weight of the entropy bonus in their update
 
 
-RELIEF = 1.02
+CEILING_GROWTH = 1.02
 """Factor on the ceiling of the learning rate per update: a halved one is whole after 36."""
 
-Apply = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array, jax.Array]]
+PolicyAtIndex = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array, jax.Array]]
 """(params, indices [B]) -> (action distribution, values [B], squared error of the estimated
 velocity [B], zero without an estimator) at those observations."""
 
@@ -68,6 +68,11 @@ def init(config: PPOConfig, params: Params) -> Learner:
 def acting(params: Params) -> Params:
     """The part of the parameters that a policy acts with."""
     return {name: params[name] for name in ACTING if name in params}
+
+
+def deployed(learner: Learner) -> Params:
+    """The networks as a policy uses them: the actor is the average over the last updates."""
+    return {**learner.params, **learner.average}
 
 
 def gae(
@@ -111,7 +116,11 @@ def gae(
 
 
 def loss(
-    config: PPOConfig, apply: Apply, drawn: Drawn, params: Params, batch: Samples
+    config: PPOConfig,
+    apply: PolicyAtIndex,
+    constants: RolloutConstants,
+    params: Params,
+    batch: Samples,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped surrogate + clipped value loss - entropy bonus + error of the velocity estimate, over
     the valid samples of `batch`."""
@@ -130,14 +139,14 @@ def loss(
     value_loss = mean(errors)
 
     entropy, estimate_loss = dist.entropy(), mean(estimate_error)
-    total = policy_loss + config.value_coef * value_loss - drawn.entropy_coef * entropy
+    total = policy_loss + config.value_coef * value_loss - constants.entropy_coef * entropy
     total += config.estimate_coef * estimate_loss
     info = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,
         "estimate_loss": estimate_loss,
         "entropy": entropy,
-        "kl": mean(dist.kl_from(Gaussian(batch.mean, drawn.log_std))),
+        "kl": mean(dist.kl_from(Gaussian(batch.mean, constants.log_std))),
         "clip_share": mean(jnp.abs(ratio - 1.0) > config.clip),
     }
     return total, info
@@ -155,11 +164,15 @@ def adapt_learning_rate(
 
 
 def gradient_step(
-    config: PPOConfig, apply: Apply, drawn: Drawn, learner: Learner, batch: Samples
+    config: PPOConfig,
+    apply: PolicyAtIndex,
+    constants: RolloutConstants,
+    learner: Learner,
+    batch: Samples,
 ) -> tuple[Learner, dict[str, jax.Array]]:
     """One minibatch. A non-finite gradient changes nothing and is counted in `skipped`."""
     grads, info = jax.grad(loss, argnums=3, has_aux=True)(
-        config, apply, drawn, learner.params, batch
+        config, apply, constants, learner.params, batch
     )
     grad_norm = optax.tree.norm(grads)
     ceiling = learner.rate_ceiling
@@ -174,21 +187,21 @@ def gradient_step(
 
 def update(
     config: PPOConfig,
-    apply: Apply,
-    drawn: Drawn,
+    apply: PolicyAtIndex,
+    constants: RolloutConstants,
     learner: Learner,
     samples: Samples,
     key: jax.Array,
 ) -> tuple[Learner, dict[str, jax.Array]]:
     """All epochs of one rollout's samples [B, ...]: shuffled, one gradient step a minibatch."""
-    ceiling = jnp.minimum(RELIEF * learner.rate_ceiling, config.learning_rate_bounds[1])
+    ceiling = jnp.minimum(CEILING_GROWTH * learner.rate_ceiling, config.learning_rate_bounds[1])
     learner = learner.replace(rate_ceiling=ceiling)
     samples = samples.replace(advantage=_normalise(samples.advantage, samples.valid))
     size = samples.index.shape[0]
 
     def minibatch(learner: Learner, rows: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
         batch = jax.tree.map(lambda x: x[rows], samples)
-        return gradient_step(config, apply, drawn, learner, batch)
+        return gradient_step(config, apply, constants, learner, batch)
 
     def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
         rows = jax.random.permutation(key, size).reshape(config.minibatches, -1)

@@ -17,14 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from rich.progress import Progress
+from rich.table import Table
 
+from kslc_jax import cli, evaluate, files, runtime
 from kslc_jax import config as config_lib
-from kslc_jax import evaluate, runtime
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.plots import EVALUATION
+from kslc_jax.evaluation.tables import console
 
 SHIPPED = "xbot_l_run"
-MILESTONES = "milestones.json"
 
 BANDS = {
     "survival": 0.15,
@@ -98,25 +99,24 @@ def compare_milestones(old: dict[str, float], new: dict[str, float]) -> list[Row
 
 def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
-    those at which each speed [m/s] was reached. Raises as `runner.train`, and Stopped."""
-    from kslc_jax import plots, runner
-    from kslc_jax.checkpoint import has_checkpoints
-    from kslc_jax.logs import Progress
+    those at which each speed [m/s] was reached. Raises as `loop.train`, and Stopped."""
+    from kslc_jax import plots
+    from kslc_jax.checkpoint_format import has_checkpoints
+    from kslc_jax.training import loop
+    from kslc_jax.training.logs import Progress
 
     run = dataclasses.replace(config.run, steps=round(until))
     config = dataclasses.replace(config, seed=args.seed, run=run)
     going_on = has_checkpoints(args.run_dir)
-    state = runner.train(config, args.run_dir, going_on, Progress(config))
+    state = loop.train(config, args.run_dir, going_on, Progress(config))
     if int(state.step) < config.num_updates:
         raise Stopped("stopped; the same command tries the policy again and goes on training")
     records = plots.read_metrics(args.run_dir)
     return {f"{speed:g}": steps for speed, steps, _ in plots.milestones(records)}
 
 
-def report(rows: list[Row], title: str):
-    """What was compared, as a rich table."""
-    from rich.table import Table
-
+def report(rows: list[Row], title: str) -> Table:
+    """What was compared."""
     out = Table(title=title, title_justify="left")
     for column in ("what", "published", "here", ""):
         out.add_column(column, justify="left" if column == "what" else "right")
@@ -127,13 +127,11 @@ def report(rows: list[Row], title: str):
 
 def repeat(args: Args) -> list[Row]:
     """Everything that was asked for; ConfigError, CheckpointError or RunError where it cannot."""
-    from rich.progress import Progress
-
-    from kslc_jax.checkpoint import POLICIES, load_policy
+    from kslc_jax.policy import POLICIES, load_policy
 
     policy = load_policy(args.policy)
     folder = POLICIES / args.policy
-    old = stored(folder, EVALUATION)
+    old = stored(folder, files.EVALUATION)
     how = evaluate.Args(
         Path(args.policy),
         speeds=tuple(row["command"] for row in old["rows"]),
@@ -143,14 +141,14 @@ def repeat(args: Args) -> list[Row]:
         noise=old.get("noise", False),
         seed=old.get("seed", 0),
     )
-    screen = evaluate.console()
+    screen = console()
     with Progress(console=screen, transient=True) as bar:
         task = bar.add_task("trying", total=1.0)
         new = evaluate.sweep(how, policy, lambda share: bar.update(task, completed=share))
     rows = compare_rows(old["rows"], new)
     screen.print(report(rows, f"{args.policy}: evaluation"))
     if args.train:
-        milestones = stored(folder, MILESTONES)
+        milestones = stored(folder, files.MILESTONES)
         found = retrain(args, policy.config, LATER * max(milestones.values()))
         trained = compare_milestones(milestones, found)
         screen.print(report(trained, f"{args.policy}: training, at most {LATER:g} times as long"))
@@ -160,25 +158,18 @@ def repeat(args: Args) -> list[Row]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    from kslc_jax.checkpoint import CheckpointError
-    from kslc_jax.recovery import NumbersError
-    from kslc_jax.run_folder import RunError
+    return cli.run(lambda: _compare(cli.parse("reproduce", Args, argv, __doc__)))
 
+
+def _compare(args: Args) -> int:
+    """The exit code: 1 where a number lies outside its band."""
+    if args.train:
+        runtime.require_good_jax()
     try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.reproduce")
-        if args.train:
-            runtime.require_good_jax()
         rows = repeat(args)
-    except Stopped as error:
-        print(error, file=sys.stderr)
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
         return 130
-    except NumbersError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except (CheckpointError, ConfigError, RunError, runtime.JaxError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
     differing = [what for what, _, _, agrees in rows if not agrees]
     if differing:
         print(f"{len(differing)} of {len(rows)} numbers lie outside their band")

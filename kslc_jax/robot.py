@@ -8,14 +8,14 @@ collision of all parts, joint friction.
 import functools
 import itertools
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
+from kslc_jax import robots
 from kslc_jax.config import Fidelity
 
-MODEL_PATH = Path(__file__).parent / "assets" / "xbot_l.xml"
+MODEL_PATH = robots.XBOT_L
 
 _FLOOR_BIT, _PART_BIT = 1, 2
 _DECOR_GROUP = 1
@@ -103,7 +103,7 @@ def load(
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
     # A diverged simulation must show as NaN, not restart behind our back.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # Torque limits depend on joint speed and are applied in physics.motor_torque. The engine must
+    # Torque limits depend on joint speed and are applied in motors.motor_torque. The engine must
     # not clamp as well: C MuJoCo drops the implicit damping of a saturated actuator, MJX keeps it.
     model.actuator_forcelimited[:] = 0
     joints = model.actuator_trnid[:, 0]

@@ -1,6 +1,7 @@
 """What must be set before JAX starts, and what the machine decides. Imports JAX only when asked."""
 
 import contextlib
+import ctypes.util
 import faulthandler
 import inspect
 import logging
@@ -12,6 +13,8 @@ from collections import deque
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
+
+from kslc_jax.errors import UserError
 
 BAD_JAX = ("0.10.", "0.11.0")
 """JAX versions whose CPU backend can hang for ever in batched Cholesky factorisations."""
@@ -29,17 +32,40 @@ NVIDIA = Path("/dev/nvidia0")
 """There where the driver of an NVIDIA GPU is."""
 
 
+GL_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
+"""Values of MUJOCO_GL, the better one first, and the libraries that they need."""
+
+
 def cache_dir() -> Path:
     """Folder of the persistent compilation cache."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "kslc_jax"
 
 
-def prepare() -> None:
-    """Quiet XLA and orbax, and a persistent compilation cache; values the user set stay."""
+def prepare(gl: bool = True) -> None:
+    """Sets environment variables: a quiet XLA, a persistent compilation cache, and with `gl` the
+    library that draws off screen. Variables that the user has set stay. Call it before JAX and
+    MuJoCo are imported."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_dir()))
+    if gl:
+        choose_gl()
 
+
+def choose_gl() -> None:
+    """Sets MUJOCO_GL to EGL, or else OSMesa, if the user has not set it and the library is there.
+    MuJoCo reads it once, when it is first imported."""
+    if os.environ.get("MUJOCO_GL"):
+        return
+    for backend, library in GL_LIBRARIES.items():
+        if ctypes.util.find_library(library):
+            os.environ["MUJOCO_GL"] = backend
+            return
+
+
+def quiet() -> None:
+    """Silences what libraries say of errors that this package reports itself. It changes the whole
+    process: for commands only."""
     # Orbax raises what went wrong, and besides tells of it in pages of its threads' tracebacks.
     for name in ("absl", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -72,7 +98,7 @@ def idle_gpu() -> str:
     return f"{IDLE_GPU}: {CUDA_FIX}"
 
 
-class JaxError(RuntimeError):
+class JaxError(UserError):
     """An installed JAX that must not be trained with."""
 
 

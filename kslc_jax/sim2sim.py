@@ -22,12 +22,21 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
+from rich.progress import Progress
+from rich.table import Table
 
-from kslc_jax import evaluate, files, runtime
+from kslc_jax import cli, evaluate, files
 from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig, require_seed
+from kslc_jax.errors import MissingPackage
+from kslc_jax.evaluation import tables
+from kslc_jax.evaluation.tables import Row
+
+if TYPE_CHECKING:
+    from kslc_jax.evaluation.trials import Setting
+    from kslc_jax.policy import Policy
 
 Engine = Literal["mujoco", "drake"]
 
@@ -126,19 +135,19 @@ _ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
 
 def simulator(engine: Engine):
     """What steps `trials.Setting`s in that engine: None for MuJoCo, which is what their physics
-    config says; ConfigError where it is not installed."""
+    config says; MissingPackage where it is not installed."""
     if engine == "mujoco":
         return None
     try:
-        from kslc_jax import drake
+        from kslc_jax.evaluation import drake
     except ImportError as error:
-        raise ConfigError(f"{error}; try: pip install 'kslc_jax[drake]'") from error
+        raise MissingPackage(f"{error}; try: pip install 'kslc_jax[drake]'") from error
     return drake.step
 
 
-def setting(args: Args, condition: str):
-    """The conditions of one sweep, a `trials.Setting`."""
-    from kslc_jax import trials
+def setting(args: Args, condition: str) -> "Setting":
+    """The conditions of one sweep."""
+    from kslc_jax.evaluation import trials
 
     made = changes(condition)
     robot = {name: value for name, value in made.items() if name in _ROBOT}
@@ -154,29 +163,34 @@ def setting(args: Args, condition: str):
     )
 
 
-Results = dict[str, list[dict[str, float]]]
+Results = dict[str, list[Row]]
 
 
-def sweeps(args: Args, policy, progress=lambda condition, share: None) -> Results:
-    """Rows of `evaluate.measure` for every condition; `progress` is told where it is."""
+def sweeps(
+    args: Args,
+    policy: "Policy",
+    progress: Callable[[str, float], None] = lambda condition, share: None,
+) -> Results:
+    """Rows of `measure` for every condition; `progress` is told where it is."""
+    from kslc_jax.evaluation.measure import measure
+
     return {
-        condition: evaluate.measure(
+        condition: measure(
             policy,
             setting(args, condition),
             args.speeds,
             args.seeds,
             args.seed,
             lambda share, condition=condition: progress(condition, share),
-            beside=(args.sideways, args.turn),
+            vy=args.sideways,
+            yaw_rate=args.turn,
         )
         for condition in args.conditions
     }
 
 
-def summary(results: Results, title: str):
-    """Survival and mean speed of every condition and commanded speed, as a rich table."""
-    from rich.table import Table
-
+def summary(results: Results, title: str) -> Table:
+    """Survival and mean speed of every condition and commanded speed."""
     out = Table(title=title, title_justify="left")
     out.add_column("survived, mean vx [m/s]")
     for row in results["nominal"]:
@@ -189,28 +203,17 @@ def summary(results: Results, title: str):
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    runtime.prepare()
-    from kslc_jax.checkpoint import CheckpointError
-
-    try:
-        args = tyro.cli(Args, args=argv, description=__doc__, prog="python -m kslc_jax.sim2sim")
-        simulator(args.engine)  # what is not installed is told before anything is loaded
-        _report(args)
-    except (CheckpointError, ConfigError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    return cli.run(lambda: _report(cli.parse("sim2sim", Args, argv, __doc__)))
 
 
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, keeps the numbers."""
-    from rich.progress import Progress
-
-    from kslc_jax.checkpoint import load_policy
+    simulator(args.engine)  # what is not installed is told before anything is loaded
+    from kslc_jax.policy import load_policy
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
-    screen = evaluate.console()
+    screen = tables.console()
     # Reports come once a simulated second: the estimate of the time left needs a long memory.
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in args.conditions}
@@ -221,12 +224,12 @@ def _report(args: Args) -> None:
 
         results = sweeps(args, policy, progress)
     title = f"{args.policy}, train step {policy.step}, {args.engine}"
-    columns = evaluate.HEADLINE
+    columns = tables.HEADLINE
     if args.sideways or args.turn:
         title += f", with {args.sideways:g} m/s sideways and {args.turn:g} rad/s"
-        columns = evaluate.ASIDE
+        columns = tables.SIDEWAYS_COLUMNS
     for condition, rows in results.items():
-        screen.print(evaluate.table(rows, f"{title}, {condition}", columns))
+        screen.print(tables.table(rows, f"{title}, {condition}", columns))
     if len(results) > 1:
         screen.print(summary(results, title))
     if args.json is not None:

@@ -26,9 +26,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from kslc_jax import cli, runtime
 from kslc_jax import config as config_lib
-from kslc_jax import runtime
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.errors import UserError
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -82,7 +83,7 @@ def join(argv: list[str]) -> None:
     given = tuple(vars(known).values())
     if any(given) and not {"-h", "--help"} & set(argv):
         who = cluster(*given)
-        from kslc_jax import devices
+        from kslc_jax.training import devices
 
         devices.join(*who)
 
@@ -116,18 +117,12 @@ def parse(argv: list[str]) -> Args:
     if known.resume and known.run_dir is None and not helping:
         raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
     if known.resume and not helping and known.preset is None and not known.without:
-        from kslc_jax import run_folder
+        from kslc_jax.training import run_folder
 
         base = run_folder.read_config(known.run_dir)
-    else:  # also on resume: the runner names what the stored config has otherwise
+    else:  # also on resume: run_folder names what the stored config has otherwise
         base = config_lib.preset(known.preset or DEFAULT, tuple(known.without))
-    args = tyro.cli(
-        Args,
-        args=argv,
-        default=Args(config=base),
-        description=__doc__,
-        prog="python -m kslc_jax.train",
-    )
+    args = cli.parse("train", Args, argv, __doc__, default=Args(config=base))
     if args.resume and args.start_from:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
     if args.profile < 0:
@@ -149,18 +144,19 @@ def headline(args: Args) -> tuple[str, Path]:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    argv = sys.argv[1:] if argv is None else argv
-    runtime.prepare()
-    try:
-        join(argv)
-        args = parse(argv)
-        runtime.require_good_jax()
-        from kslc_jax import devices
+    return cli.run(lambda: _main(sys.argv[1:] if argv is None else argv))
 
+
+def _main(argv: list[str]) -> int:
+    join(argv)
+    args = parse(argv)
+    runtime.require_good_jax()
+    from kslc_jax.training import devices
+
+    try:
         mesh = devices.pick(args.config, None if args.devices == "auto" else args.devices)
-    except (ConfigError, RuntimeError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    except RuntimeError as error:  # a backend that does not start
+        raise UserError(str(error)) from error
     return _train(args, mesh)
 
 
@@ -168,27 +164,24 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     """The exit code. A process of several whose failure is its own ends at once."""
     from rich.console import Console
 
-    from kslc_jax import devices, runner
-    from kslc_jax.checkpoint import CheckpointError
-    from kslc_jax.logs import Progress
-    from kslc_jax.recovery import NumbersError
-    from kslc_jax.run_folder import RunError
+    from kslc_jax.training import devices, loop
+    from kslc_jax.training.logs import Progress
+    from kslc_jax.training.recovery import NumbersError
 
     title, run_dir = headline(args)
     progress = Progress(args.config, None if devices.is_first() else Console(quiet=True))
-    progress.say(f"{title}: {runner.describe(args.config, run_dir, mesh)}")
+    progress.say(f"{title}: {loop.describe(args.config, run_dir, mesh)}")
     if idle := runtime.idle_gpu():
         progress.warn(idle)
     how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
     try:
-        runner.train(args.config, run_dir, args.resume, progress, **how)
-    except (ConfigError, RunError, CheckpointError, devices.Elsewhere) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        loop.train(args.config, run_dir, args.resume, progress, **how)
     except NumbersError as error:  # all processes meet it
         if devices.is_first():
-            print(f"error: {error}", file=sys.stderr)
-        return 1
+            raise
+        return error.exit_code
+    except UserError:
+        raise
     except KeyboardInterrupt:
         print("interrupted before the state was saved", file=sys.stderr)
         return devices.leave(130)

@@ -13,18 +13,19 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import env, maths, networks, observations, ppo
+from kslc_jax import env, networks, observations, ppo
 from kslc_jax.config import Config, RunConfig
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Gaussian, Params
-from kslc_jax.ppo import Drawn, Learner, Samples
+from kslc_jax.ppo import Learner, RolloutConstants, Samples
+from kslc_jax.rollout import Trajectory, collect, finite, or_new_episode, windows
 
 _VELOCITY = observations.slices(observations.CRITIC)["base_linvel"]
 """Where the critic's frame has what an estimator learns."""
 
 Metrics = dict[str, jax.Array]
-Spread = Callable[[jax.Array], jax.Array]
+ShardIndex = Callable[[jax.Array], jax.Array]
 
 
 @flax.struct.dataclass
@@ -36,20 +37,6 @@ class TrainState:
     curriculum: Curriculum
     key: jax.Array  # [] typed PRNG key, never advanced: steps fold their number in
     step: jax.Array  # [] int, train steps done
-
-
-@flax.struct.dataclass
-class Trajectory:
-    """One rollout, [T, N, ...]. Frames are stored once; windows are gathered at update time."""
-
-    action: jax.Array  # [T, N, 16]
-    mean: jax.Array  # [T, N, 16]
-    log_prob: jax.Array  # [T, N]
-    value: jax.Array  # [T, N]
-    age: jax.Array  # [T, N] int, control steps since the reset
-    frame: jax.Array  # [T, N, 59] newest actor frame at each step
-    privileged: jax.Array  # [T, N, 89] newest critic frame
-    outcome: Outcome  # [T, N]
 
 
 def make(
@@ -98,25 +85,25 @@ def start_from(
     params = jax.tree.map(jnp.copy, params)
     average = jax.tree.map(jnp.copy, ppo.acting(params))
     learner = state.learner.replace(params=params, average=average)
-    curriculum = curriculum_lib.taken_over(config, curriculum)
+    curriculum = curriculum_lib.inherit(config, curriculum)
     curriculum = jax.tree.map(lambda x, like: x.astype(like.dtype), curriculum, state.curriculum)
     return state.replace(learner=learner, curriculum=curriculum)
 
 
 def step(
-    config: Config, state: TrainState, spread: Spread = lambda index: index
+    config: Config, state: TrainState, shard_index: ShardIndex = lambda index: index
 ) -> tuple[TrainState, Metrics]:
-    """One rollout and one update; see the module's first line. `spread` places the indices of a
-    minibatch's samples where there are several devices."""
+    """One rollout and one update; see the module's first line. `shard_index` places the indices of
+    a minibatch's samples where there are several devices."""
     key_roll, key_update = step_keys(state)
     params = state.learner.params
-    start = jax.vmap(usable)(state.env)
-    envs, traj = rollout(config, params, start, state.curriculum, key_roll)
+    start = jax.vmap(or_new_episode)(state.env)
+    envs, traj = collect(config, params, start, state.curriculum, key_roll)
     last_value = networks.value(config, params, envs.privileged_history)
-    samples = _samples(config, traj, last_value)
-    apply = _observer(config, start, traj, spread)
+    samples = samples_of(config, traj, last_value)
+    apply = _observer(config, start, traj, shard_index)
     learner, losses = ppo.update(
-        config.ppo, apply, drawn(config, state), state.learner, samples, key_update
+        config.ppo, apply, rollout_constants(config, state), state.learner, samples, key_update
     )
     progress = _progress(config, traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
@@ -124,7 +111,7 @@ def step(
     return new, _metrics(config, new, traj.outcome, progress, losses)
 
 
-def drawn(config: Config, state: TrainState) -> Drawn:
+def rollout_constants(config: Config, state: TrainState) -> RolloutConstants:
     """What the samples of the coming rollout share.
 
     With `ppo.entropy_fades` the entropy bonus falls with what is left to climb: a policy that is
@@ -132,8 +119,8 @@ def drawn(config: Config, state: TrainState) -> Drawn:
     """
     coef = jnp.asarray(config.ppo.entropy_coef, jnp.float32)
     if config.ppo.entropy_fades:
-        coef *= curriculum_lib.left(config.curriculum, state.curriculum)
-    return Drawn(networks.log_std(config, state.learner.params), coef)
+        coef *= curriculum_lib.remaining_share(config.curriculum, state.curriculum)
+    return RolloutConstants(networks.log_std(config, state.learner.params), coef)
 
 
 def step_keys(state: TrainState) -> jax.Array:
@@ -141,77 +128,7 @@ def step_keys(state: TrainState) -> jax.Array:
     return jax.random.split(jax.random.fold_in(state.key, state.step))
 
 
-def rollout(
-    config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
-) -> tuple[EnvState, Trajectory]:
-    """T control steps of N environments under the sampled policy."""
-
-    def one(envs: EnvState, key: jax.Array) -> tuple[EnvState, Trajectory]:
-        new, traj = control_step(config, params, envs, curriculum, key)
-        new, outcome = jax.vmap(contain)(new, traj.outcome)
-        return new, traj.replace(outcome=outcome)
-
-    return jax.lax.scan(one, envs, jax.random.split(key, config.ppo.rollout_steps))
-
-
-def control_step(
-    config: Config, params: Params, envs: EnvState, curriculum: Curriculum, key: jax.Array
-) -> tuple[EnvState, Trajectory]:
-    """One control step of N environments, as it comes out: a row of the trajectory, [N]."""
-    key_act, key_env = jax.random.split(key)
-    dist = networks.policy(config, params, envs.history)
-    action = dist.sample(key_act)
-    keys = jax.random.split(key_env, config.env.num_envs)
-    new, outcome = jax.vmap(env.step, (None, 0, 0, 0, None))(config, envs, action, keys, curriculum)
-    return new, Trajectory(
-        action=action,
-        mean=dist.mean,
-        log_prob=dist.log_prob(action),
-        value=networks.value(config, params, envs.privileged_history),
-        age=envs.time,
-        frame=envs.history[:, -1],
-        privileged=envs.privileged_history[:, -1],
-        outcome=outcome,
-    )
-
-
-def finite(tree: object) -> jax.Array:
-    """[] bool: no number of the tree is NaN or infinite."""
-    leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
-    flags = jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]).astype(jnp.float32)
-    # A dot product, which XLA computes once: it would fuse a chain of ands into the select of every
-    # leaf that depends on it, for twice the instructions and twice the time to compile.
-    return jnp.dot(flags, jnp.ones_like(flags)) == len(leaves)
-
-
-def _blank(state: EnvState) -> EnvState:
-    """A state without a number in it, whose physics is sure to break: `env.step` makes of it a new
-    episode."""
-    blank = jax.tree.map(jnp.zeros_like, state)
-    physics = blank.physics.replace(qvel=jnp.full_like(blank.physics.qvel, jnp.nan))
-    return blank.replace(physics=physics)
-
-
-def usable(state: EnvState) -> EnvState:
-    """The state of ONE environment, or a blank where a number in it is not finite."""
-    return maths.tree_where(finite(state), state, _blank(state))
-
-
-def contain(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
-    """What a step of ONE environment gave. Where any number is not finite the step counts as
-    broken: it is worth nothing, and a new episode follows."""
-    whole = finite(state)
-    broken = out.broken | ~whole | ~finite(out)
-    lost = ~whole | (broken & ~(out.terminated | out.truncated))
-    nothing = jax.tree.map(jnp.zeros_like, out)
-    nothing = nothing.replace(terminated=jnp.ones((), bool), broken=jnp.ones((), bool))
-    return (
-        maths.tree_where(lost, _blank(state), state),
-        maths.tree_where(broken, nothing, out),
-    )
-
-
-def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
+def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
     """Flattened PPO samples [T * N, ...] with advantages."""
     out = traj.outcome
     done = out.terminated | out.truncated
@@ -232,14 +149,14 @@ def _samples(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples
 
 
 def _observer(
-    config: Config, start: EnvState, traj: Trajectory, spread: Spread = lambda index: index
-) -> ppo.Apply:
+    config: Config, start: EnvState, traj: Trajectory, shard_index: ShardIndex = lambda index: index
+) -> ppo.PolicyAtIndex:
     """The networks at the observations of `traj`, named by their flat index t * N + n."""
-    actor = _windows(start.history, traj.frame, traj.age)
-    critic = _windows(start.privileged_history, traj.privileged, traj.age)
+    actor = windows(start.history, traj.frame, traj.age)
+    critic = windows(start.privileged_history, traj.privileged, traj.age)
 
     def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array, jax.Array]:
-        index = spread(index)
+        index = shard_index(index)
         dist, estimate = networks.policy_and_estimate(config, params, actor(index))
         seen = critic(index)
         error = jnp.zeros(index.shape)
@@ -248,28 +165,6 @@ def _observer(
         return dist, networks.value(config, params, seen), error
 
     return apply
-
-
-def _windows(
-    history: jax.Array, frame: jax.Array, age: jax.Array
-) -> Callable[[jax.Array], jax.Array]:
-    """Gathers the histories [B, K, W] that were seen at flat indices t * N + n.
-
-    Frames [T, N, W] are kept once, behind those of the `history` [N, K, W] at the start; what is
-    older than the episode is zero, as after a reset.
-    """
-    num_envs, frames, _ = history.shape
-    before = jnp.swapaxes(history[:, :-1], 0, 1)
-    rows = jnp.concatenate([before, frame]).reshape(-1, frame.shape[-1])
-    ages = age.reshape(-1)
-    back = jnp.arange(frames)
-
-    def gather(index: jax.Array) -> jax.Array:
-        window = rows[index[:, None] + back * num_envs]
-        known = frames - 1 - back <= ages[index][:, None]
-        return jnp.where(known[..., None], window, 0.0)
-
-    return gather
 
 
 def _progress(config: Config, out: Outcome) -> Progress:

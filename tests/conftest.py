@@ -6,7 +6,9 @@ os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import pytest
 
-from kslc_jax import config, robot
+from kslc_jax import config, robot, runtime
+
+runtime.quiet()  # as in a command: saves that fail on purpose leave no stray tracebacks
 
 
 @pytest.fixture(scope="session")

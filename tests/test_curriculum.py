@@ -53,15 +53,17 @@ def test_start():
 
 def test_another_trainings_progress_ends_at_the_limits_of_this_one():
     far = state(v_max=4.5, cycle_time=0.38, tracking=0.8)
-    here = curriculum.taken_over(PAPER, far)
+    here = curriculum.inherit(PAPER, far)
     assert float(here.v_max) == CONFIG.v_limit == 3.5
     assert float(here.cycle_time) == pytest.approx(CONFIG.cycle_min)
     assert float(here.tracking) == pytest.approx(0.8)
-    assert float(curriculum.left(CONFIG, here)) == 0.0  # not below: it scales the entropy bonus
-    near = curriculum.taken_over(PAPER, state(v_max=2.0, cycle_time=0.55))
+    assert (
+        float(curriculum.remaining_share(CONFIG, here)) == 0.0
+    )  # not below: it scales the entropy bonus
+    near = curriculum.inherit(PAPER, state(v_max=2.0, cycle_time=0.55))
     assert float(near.v_max) == 2.0 and float(near.cycle_time) == pytest.approx(0.55)
     fixed = preset("paper", ("velocity-curriculum", "cycle-curriculum"))
-    here, start = curriculum.taken_over(fixed, near), curriculum.init(fixed)
+    here, start = curriculum.inherit(fixed, near), curriculum.init(fixed)
     assert (here.v_max, here.cycle_time) == (start.v_max, start.cycle_time)
 
 
@@ -234,9 +236,9 @@ def test_start_average_cannot_open_the_gate_early():
 @pytest.mark.parametrize(("v_max", "left"), [(0.5, 1.0), (2.0, 0.5), (3.5, 0.0)])
 def test_what_is_left_of_the_way(v_max, left):
     """From 0.5 to 3.5 m/s."""
-    assert float(curriculum.left(CONFIG, state(v_max=v_max))) == pytest.approx(left)
+    assert float(curriculum.remaining_share(CONFIG, state(v_max=v_max))) == pytest.approx(left)
 
 
 def test_without_a_way_all_of_it_is_left():
     config = dataclasses.replace(CONFIG, v_start=3.5)
-    assert float(curriculum.left(config, state(v_max=3.5))) == 1.0
+    assert float(curriculum.remaining_share(config, state(v_max=3.5))) == 1.0

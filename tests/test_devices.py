@@ -18,10 +18,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
+from processes import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
 
-from kslc_jax import checkpoint, devices, env, observations, physics, train, train_step
+from kslc_jax import checkpoint_format, env, observations, physics, train, train_step
 from kslc_jax.config import NUM_JOINTS, ConfigError, preset
+from kslc_jax.training import checkpoint, devices
 
 STEPS = 3
 MJX = dataclasses.replace(preset("debug"), physics=physics.PhysicsConfig(engine="mjx"))
@@ -38,7 +39,7 @@ def glide(config, state, target, dynamics, ground_friction):
 
 def numbers(tree) -> dict[str, np.ndarray]:
     return {
-        jax.tree_util.keystr(path): checkpoint.host_array(x)
+        jax.tree_util.keystr(path): checkpoint_format.host_array(x)
         for path, x in jax.tree.leaves_with_path(tree)
     }
 

@@ -16,18 +16,19 @@ import onnx
 import pytest
 
 from kslc_jax import (
-    checkpoint,
+    checkpoint_format,
     curriculum,
     env,
     export,
+    motors,
     networks,
     observations,
-    physics,
     randomize,
     robot,
-    trials,
 )
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
+from kslc_jax.evaluation import trials
 
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
@@ -59,7 +60,7 @@ def make_policy(kind):
     reached = curriculum.init(config).replace(
         v_max=jnp.asarray(V_MAX), cycle_time=jnp.asarray(CYCLE)
     )
-    return checkpoint.Policy(config, params, reached, 7)
+    return policy_lib.Policy(config, params, reached, 7)
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,7 @@ def test_metadata(symmetric, xbot):
     assert data["default_joint_pos"] == [0] * 16 and data["control_dt"] == 0.01
     assert data["action_scale"] == 0.25 and data["action_clip"] == 18
     assert data["history_length"] == 3 and data["observation_clip"] == 18
-    assert sum(c["width"] for c in data["frame"]) == 59
+    assert sum(c["width"] for c in data["frame"]) == observations.ACTOR_WIDTH
     assert data["frame"][1] == {"name": "command", "width": 3, "scale": (2, 2, 1)}
     assert data["gait"] == {
         "cycle_time": pytest.approx(CYCLE),
@@ -194,17 +195,17 @@ def test_without_onnxruntime_it_says_so(policy, onnx_file, monkeypatch):
 @pytest.fixture(scope="module")
 def saved(symmetric, tmp_path_factory):
     folder = tmp_path_factory.mktemp("policies") / "saved"
-    checkpoint.save_policy(symmetric, folder)
+    policy_lib.save_policy(symmetric, folder)
     return folder
 
 
 def test_a_policy_folder_is_the_whole_policy(symmetric, saved):
-    back = checkpoint.load_policy(saved)
+    back = policy_lib.load_policy(saved)
     assert back.config == symmetric.config and back.step == symmetric.step
     jax.tree.map(np.testing.assert_array_equal, back.params, symmetric.params)
     jax.tree.map(np.testing.assert_array_equal, back.curriculum, symmetric.curriculum)
-    with pytest.raises(checkpoint.CheckpointError, match="cannot write"):
-        checkpoint.save_policy(symmetric, saved)
+    with pytest.raises(checkpoint_format.CheckpointError, match="cannot write"):
+        policy_lib.save_policy(symmetric, saved)
 
 
 def test_orbax_has_to_be_asked_for(saved, tmp_path, capsys, monkeypatch):
@@ -326,7 +327,7 @@ def test_motor_torque_is_the_packages(runner, symmetric, xbot):
     meta = runner.SimpleNamespace(**export.metadata(symmetric))
     np.testing.assert_allclose(
         runner.motor_torque(meta, target, q, dq),
-        physics.motor_torque(xbot, one, q, dq, target, np),
+        motors.motor_torque(xbot, one, q, dq, target, np),
         atol=1e-9,
     )
 

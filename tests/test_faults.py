@@ -18,22 +18,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import METRICS
+from processes import METRICS
 
 from kslc_jax import (
-    checkpoint,
+    checkpoint_format,
     doctor,
+    files,
     physics,
     ppo,
-    recovery,
-    run_folder,
+    rollout,
     runtime,
     train,
     train_step,
 )
-from kslc_jax.checkpoint import CheckpointError, Store
+from kslc_jax import policy as policy_lib
+from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import preset, to_dict
-from kslc_jax.logs import MetricsFile
+from kslc_jax.training import recovery, run_folder
+from kslc_jax.training.checkpoint import Store
+from kslc_jax.training.logs import MetricsFile
 
 ROOT = Path(__file__).parents[1]
 DEBUG = preset("debug")
@@ -78,7 +81,7 @@ def state_at(like):
 
 
 def numbers(tree):
-    return [checkpoint.host_array(x) for x in jax.tree.leaves(tree)]
+    return [checkpoint_format.host_array(x) for x in jax.tree.leaves(tree)]
 
 
 def same(a, b):
@@ -195,7 +198,7 @@ def training(state_at, tmp_path, monkeypatch):
 
             def __call__(self, state):
                 state = poison(state)
-                finite = train_step.finite(state.learner.params)
+                finite = rollout.finite(state.learner.params)
                 skipped = jnp.isinf(state.learner.learning_rate)
                 metrics = METRICS | {"finite": finite, "ppo/skipped": skipped}
                 return state.replace(step=state.step + 1), metrics
@@ -229,7 +232,7 @@ class TestGoingBack:
         assert "warning: the learner or the curriculum is not finite; back to train step 5" in out
         assert "attempt 1 of 3" in out and "done: 8 train steps, saved" in out
         assert steps_of(training.dir) == list(range(1, 9))
-        policy = checkpoint.load_policy(training.dir)
+        policy = policy_lib.load_policy(training.dir)
         assert policy.step == 8
 
     def test_always_bad_stops_with_one_line_and_a_dump(self, training, capsys, state_at):
@@ -242,7 +245,7 @@ class TestGoingBack:
         (line,) = said.err.splitlines()
         assert line.startswith("error: the learner") and "doctor replay" in line
         assert Store(training.dir).steps()[-1] == 5, "a bad state was saved"
-        config, state = recovery.read_dump(training.dir / recovery.DUMP)
+        config, state = recovery.read_dump(training.dir / files.BAD_STATE)
         assert config == DEBUG and same(state.learner.params, state_at(5).learner.params)
 
     def test_no_finite_gradient_for_long(self, training, capsys, monkeypatch):
@@ -255,7 +258,7 @@ class TestGoingBack:
         assert training(poison) == 1
         said = capsys.readouterr()
         assert "not one finite gradient in 3 train steps; back to train step 3" in said.out
-        assert int(recovery.read_dump(training.dir / recovery.DUMP)[1].step) == 3
+        assert int(recovery.read_dump(training.dir / files.BAD_STATE)[1].step) == 3
 
     def test_bad_before_the_first_checkpoint_starts_anew(self, training, capsys):
         once = [True]
@@ -268,7 +271,7 @@ class TestGoingBack:
 
     def test_cautious(self, state_at):
         state = state_at(3)
-        new = recovery.cautious(state, 2)
+        new = recovery.with_lower_rate(state, 2)
         assert new.learner.learning_rate == pytest.approx(0.25 * state.learner.learning_rate)
         assert new.learner.rate_ceiling == new.learner.learning_rate
         assert new.key != state.key and same(new.learner.params, state.learner.params)
@@ -276,12 +279,12 @@ class TestGoingBack:
     def test_caution_lasts(self, made):
         """The KL rule raises the lowered learning rate by 2 % a train step at most."""
         init, step = made
-        state = recovery.cautious(init(), 1)
+        state = recovery.with_lower_rate(init(), 1)
         low = float(state.learner.learning_rate)
         assert low == pytest.approx(0.5 * DEBUG.ppo.learning_rate)
         for i in range(1, 4):
             state, metrics = step(state)
-            assert float(metrics["ppo/learning_rate"]) <= low * ppo.RELIEF**i * 1.00001
+            assert float(metrics["ppo/learning_rate"]) <= low * ppo.CEILING_GROWTH**i * 1.00001
 
     def test_replay_shows_where(self, made, tmp_path, capsys, monkeypatch):
         """A number that overflows in the first control step, in one environment."""
@@ -466,12 +469,12 @@ class TestDamage:
         # Orbax sees it in the index, the checksum in the numbers.
         said = "the numbers of 'params' are not those|Encountered error while reading"
         with pytest.raises(CheckpointError, match=said):
-            checkpoint.load_policy(tmp_path)
+            policy_lib.load_policy(tmp_path)
 
     def test_changed_meta(self, saved, restored, tmp_path):
         edit_meta(saved(tmp_path, 1), lambda meta: meta["config"].update(seed=7))
         with pytest.raises(CheckpointError, match="the numbers of 'meta' are not those"):
-            checkpoint.load_policy(tmp_path)
+            policy_lib.load_policy(tmp_path)
 
 
 def edit_meta(run_dir, change):
@@ -486,7 +489,7 @@ class TestSchema:
     """Two environments, two hidden units, one train step."""
 
     def test_policy_of_schema_1(self):
-        policy = checkpoint.load_policy(self.OLD)
+        policy = policy_lib.load_policy(self.OLD)
         assert policy.step == 1
         action = policy.act_on(jnp.full((1, 59), 0.5))
         written = [0.00246058, 0.00342976, -0.00067609, 0.00228753]
@@ -502,7 +505,9 @@ class TestSchema:
 
     def test_tree_of_this_schema(self, like):
         """Another tree needs another SCHEMA_VERSION, or old checkpoints fail in orbax's words."""
-        stored = ROOT / "tests" / "data" / f"train_state_schema_{checkpoint.SCHEMA_VERSION}.txt"
+        stored = (
+            ROOT / "tests" / "data" / f"train_state_schema_{checkpoint_format.SCHEMA_VERSION}.txt"
+        )
         leaves = [
             f"{jax.tree_util.keystr(where)} {x.dtype} {x.ndim}"
             for where, x in jax.tree.leaves_with_path(like)
@@ -512,11 +517,11 @@ class TestSchema:
     def test_without_checksums_loads(self, saved, restored, tmp_path):
         edit_meta(saved(tmp_path, 1), lambda meta: meta.pop("checksums"))
         assert restored(tmp_path) == (1, [])
-        assert checkpoint.load_policy(tmp_path).step == 1
+        assert policy_lib.load_policy(tmp_path).step == 1
 
     def test_newer_says_why_not(self, saved, restored, tmp_path):
         edit_meta(saved(tmp_path, 1), lambda meta: meta.update(schema=99))
-        for load in (checkpoint.load_policy, restored):
+        for load in (policy_lib.load_policy, restored):
             with pytest.raises(CheckpointError, match="checkpoint schema 99, this kslc_jax reads"):
                 load(tmp_path)
 
@@ -527,7 +532,7 @@ class TestSchema:
 
         edit_meta(saved(tmp_path, 1), newer)
         with pytest.raises(CheckpointError, match="schema version 99"):
-            checkpoint.load_policy(tmp_path)
+            policy_lib.load_policy(tmp_path)
 
     def test_another_robot(self, saved, restored, tmp_path):
         def other(meta):
@@ -535,7 +540,7 @@ class TestSchema:
             del meta["checksums"]
 
         edit_meta(saved(tmp_path, 1), other)
-        for load in (checkpoint.load_policy, restored):
+        for load in (policy_lib.load_policy, restored):
             with pytest.raises(CheckpointError, match=r"another robot, .*XBot-S.*XBot-L"):
                 load(tmp_path)
 
@@ -578,7 +583,7 @@ class TestNoPickle:
             shutil.copytree(source, copy)
             (copy / file).write_bytes(pickle.dumps(Bomb(mark)))
             with contextlib.suppress(CheckpointError):
-                checkpoint.load_policy(copy)
+                policy_lib.load_policy(copy)
             with contextlib.suppress(CheckpointError):
                 restored(copy)
             shutil.rmtree(copy)
@@ -663,7 +668,7 @@ class TestDoctor:
 
     def test_a_package_that_cannot_be_imported_is_no_traceback(self, monkeypatch, capsys):
         """The table is there for machines where JAX or orbax is broken."""
-        for name in ("jax", "orbax.checkpoint", "kslc_jax.checkpoint"):
+        for name in ("jax", "orbax.checkpoint", "kslc_jax.policy"):
             monkeypatch.setitem(sys.modules, name, None)
         monkeypatch.setattr(doctor, "CHECKS", (("jax", doctor.check_jax, "install another"),))
         assert doctor.main(["check"]) == 1
@@ -700,7 +705,7 @@ def twenty_steps(init, step):
     for _ in range(20):
         state, metrics = step(state)
         rows.append({name: float(value).hex() for name, value in metrics.items()})
-    return rows, checkpoint.checksum(state)
+    return rows, checkpoint_format.checksum(state)
 
 
 class TestDeterminism:
@@ -732,7 +737,7 @@ class TestDeterminism:
             text = (tmp_path / str(i) / "metrics.jsonl").read_text()
             rows.append([json.loads(line) for line in text.splitlines()])
             with contextlib.closing(Store(tmp_path / str(i))) as store:
-                sums.append(checkpoint.checksum(store.restore(like, pytest.fail)))
+                sums.append(checkpoint_format.checksum(store.restore(like, pytest.fail)))
         wall_clock = ("seconds", "steps_per_second")
         a, b = ([{k: v for k, v in r.items() if k not in wall_clock} for r in x] for x in rows)
         assert len(a) == 20 and a == b and sums[0] == sums[1]

@@ -223,7 +223,7 @@ def test_noise_factor_of_the_episode_scales_it_too():
 def test_history_is_oldest_first():
     history = jnp.zeros((3, 2))
     for i in range(1, 6):
-        history = observations.push_history(history, jnp.full(2, float(i)))
+        history = observations.append_frame(history, jnp.full(2, float(i)))
         newest = [max(i - 2, 0), max(i - 1, 0), i]
         np.testing.assert_array_equal(history[:, 0], newest)
 

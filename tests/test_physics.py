@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import maths, physics, randomize, robot
+from kslc_jax import maths, motors, physics, randomize, robot
 from kslc_jax.config import HighFidelity, PhysicsConfig, RandomizeConfig
 
 ENGINES = ("mjx", "mujoco")
@@ -33,7 +33,7 @@ class TestMotorTorque:
 
     def torque(self, q=0.0, dq=0.0, target=0.0, **factors):
         dyn = randomize.nominal().replace(**factors)
-        return physics.motor_torque(
+        return motors.motor_torque(
             robot.load(),
             dyn,
             jnp.full(16, q),
@@ -72,11 +72,11 @@ class TestMotorTorque:
         rng = np.random.default_rng(0)
         q, dq, target = rng.normal(size=(3, 16)) * 4
         dyn = randomize.nominal()
-        a = physics.motor_torque(robot.load(), dyn, q, dq, target)
-        b = physics.motor_torque(robot.load(), jax.tree.map(np.asarray, dyn), q, dq, target, np)
+        a = motors.motor_torque(robot.load(), dyn, q, dq, target)
+        b = motors.motor_torque(robot.load(), jax.tree.map(np.asarray, dyn), q, dq, target, np)
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
-        a = physics.motor_damping(robot.load(), dyn, q, dq, target, a)
-        b = physics.motor_damping(robot.load(), dyn, q, dq, target, b, np)
+        a = motors.motor_damping(robot.load(), dyn, q, dq, target, a)
+        b = motors.motor_damping(robot.load(), dyn, q, dq, target, b, np)
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
@@ -85,8 +85,8 @@ class TestMotorDamping:
         """0.6 of the PD's kd wherever the torque is the PD's at both ends of the step."""
         rng = np.random.default_rng(3)
         q, dq, target = rng.normal(size=(3, 16)) * [[0.05], [0.5], [0.05]]
-        torque = physics.motor_torque(xbot, randomize.nominal(), q, dq, target, np)
-        damping = physics.motor_damping(xbot, randomize.nominal(), q, dq, target, torque, np)
+        torque = motors.motor_torque(xbot, randomize.nominal(), q, dq, target, np)
+        damping = motors.motor_damping(xbot, randomize.nominal(), q, dq, target, torque, np)
         np.testing.assert_allclose(damping, 0.6 * xbot.kd, rtol=1e-5)
 
     @pytest.mark.parametrize("dq", [-18.0, -4.0, 0.0, 8.0, 11.0, 18.0])
@@ -98,7 +98,7 @@ class TestMotorDamping:
         q, dq, target = np.zeros(16), np.full(16, dq), np.full(16, target)
 
         def torque(speed):
-            return physics.motor_torque(xbot, dyn, q, speed, target, np)
+            return motors.motor_torque(xbot, dyn, q, speed, target, np)
 
         low, high = dq - 300.0, dq + 300.0
         for _ in range(60):
@@ -106,7 +106,7 @@ class TestMotorDamping:
             mean = 0.4 * torque(dq) + 0.6 * torque(speed)
             below = speed - dq < h / xbot.joint_inertia * mean
             low, high = np.where(below, speed, low), np.where(below, high, speed)
-        damping = physics.motor_damping(xbot, dyn, q, dq, target, torque(dq), np)
+        damping = motors.motor_damping(xbot, dyn, q, dq, target, torque(dq), np)
         change = h * torque(dq) / (xbot.joint_inertia + h * damping)
         np.testing.assert_allclose(dq + change, speed, atol=0.02)
         assert np.all(damping > -1e-6)
@@ -130,7 +130,7 @@ def test_servo_control_inverts_the_models_servo(xbot):
     """kp (ctrl - q) - damping dq of the model equals the wanted torque."""
     rng = np.random.default_rng(1)
     q, dq, torque, damping = rng.normal(size=(4, 16)) * [[0.5], [5.0], [100.0], [30.0]]
-    ctrl = physics.servo_control(xbot, torque, damping, q, dq)
+    ctrl = motors.servo_control(xbot, torque, damping, q, dq)
     np.testing.assert_allclose(xbot.kp * (ctrl - q) - damping * dq, torque, rtol=1e-9)
 
 

@@ -108,7 +108,7 @@ def test_learning_rate_stays_below_its_ceiling():
     assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(high), slow, 0.1 * low) == pytest.approx(low)
 
 
-DRAWN = ppo.Drawn(log_std=jnp.zeros(1), entropy_coef=jnp.zeros(()))
+CONSTANTS = ppo.RolloutConstants(log_std=jnp.zeros(1), entropy_coef=jnp.zeros(()))
 
 
 def samples(**changes):
@@ -138,7 +138,7 @@ def params(mean=0.0, value=0.0):
 
 class TestLoss:
     def loss(self, params, batch):
-        return ppo.loss(CONFIG, bandit_apply, DRAWN, params, batch)
+        return ppo.loss(CONFIG, bandit_apply, CONSTANTS, params, batch)
 
     def test_total(self):
         total, info = self.loss(params(mean=0.3, value=1.0), samples())
@@ -168,7 +168,7 @@ class TestLoss:
     def test_entropy_bonus(self):
         """0.01 x the entropy of N(0, 1), 1.418939."""
         paid = ppo.loss(
-            CONFIG, bandit_apply, DRAWN.replace(entropy_coef=0.01), params(), samples()
+            CONFIG, bandit_apply, CONSTANTS.replace(entropy_coef=0.01), params(), samples()
         )[0]
         assert self.loss(params(), samples())[0] - paid == pytest.approx(0.01418939, rel=1e-3)
 
@@ -176,7 +176,7 @@ class TestLoss:
 def test_non_finite_gradient_changes_nothing_and_is_counted():
     learner = ppo.init(CONFIG, params())
     bad = samples(target=jnp.array([jnp.nan, 1.0]))
-    new, info = ppo.gradient_step(CONFIG, bandit_apply, DRAWN, learner, bad)
+    new, info = ppo.gradient_step(CONFIG, bandit_apply, CONSTANTS, learner, bad)
     chex.assert_trees_all_equal(new, learner)
     assert info["skipped"] == 1.0
 
@@ -204,8 +204,8 @@ def test_update_finds_the_best_action_of_a_bandit():
             reward,
             index >= 0,
         )
-        drawn = DRAWN.replace(log_std=learner.params["log_std"])
-        return ppo.update(config, bandit_apply, drawn, learner, batch, key_update)[0]
+        constants = CONSTANTS.replace(log_std=learner.params["log_std"])
+        return ppo.update(config, bandit_apply, constants, learner, batch, key_update)[0]
 
     for key in jax.random.split(jax.random.key(0), 150):
         learner = iterate(learner, key)
@@ -222,7 +222,7 @@ def test_normalised_over_the_valid_samples():
 def test_a_lowered_ceiling_rises_by_two_percent_an_update():
     config = PPOConfig(minibatches=1)
     low = ppo.init(config, params()).replace(rate_ceiling=jnp.asarray(1e-3))
-    new, _ = ppo.update(config, bandit_apply, DRAWN, low, samples(), jax.random.key(0))
+    new, _ = ppo.update(config, bandit_apply, CONSTANTS, low, samples(), jax.random.key(0))
     assert float(new.rate_ceiling) == pytest.approx(1.02e-3)
 
 
@@ -244,6 +244,6 @@ def test_the_estimates_error_counts_by_its_weight():
         return *bandit_apply(params, index)[:2], jnp.array([1.0, 3.0])
 
     config = PPOConfig(estimate_coef=0.5)
-    without, _ = ppo.loss(config, bandit_apply, DRAWN, params(), samples())
-    total, info = ppo.loss(config, apply, DRAWN, params(), samples())
+    without, _ = ppo.loss(config, bandit_apply, CONSTANTS, params(), samples())
+    total, info = ppo.loss(config, apply, CONSTANTS, params(), samples())
     assert info["estimate_loss"] == 2.0 and total - without == pytest.approx(1.0)

@@ -14,11 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from children import DEBUG, METRICS, alone, ended, rows, started, wait_for_rows
 from jax.sharding import NamedSharding, PartitionSpec
+from processes import DEBUG, METRICS, alone, ended, rows, started, wait_for_rows
 
-from kslc_jax import checkpoint, devices, recovery, run_folder, train, train_step
+from kslc_jax import checkpoint_format, files, train, train_step
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import preset
+from kslc_jax.training import checkpoint, devices, recovery, run_folder
 
 BATCH = preset("debug").batch_size
 
@@ -29,7 +31,7 @@ SLOW = pytest.mark.slow(reason="starts Python four times")
 
 def filled(like):
     """Numbers in an array of `like`'s shape, the first of them -0."""
-    if checkpoint.is_key(like):
+    if checkpoint_format.is_key(like):
         return jax.random.key(0)
     numbers = np.arange(like.size).reshape(like.shape) % 1000 / 1000
     return jnp.asarray(-numbers if like.ndim else numbers, like.dtype)
@@ -80,7 +82,7 @@ def stored(run_dir):
     with contextlib.closing(checkpoint.Store(run_dir)) as store:
         step, state = store.steps()[-1], store.restore(like, print)
     names = {
-        jax.tree_util.keystr(path): checkpoint.host_array(x).tobytes()
+        jax.tree_util.keystr(path): checkpoint_format.host_array(x).tobytes()
         for path, x in jax.tree.leaves_with_path(state)
     }
     return step, {name: x for name, x in names.items() if name != ".step"}
@@ -103,8 +105,8 @@ def test_the_first_process_alone_writes_and_speaks(two):
     assert [row["step"] for row in rows(run_dir)] == [1, 2, 3]
     assert len(list((run_dir / "tensorboard").iterdir())) == 1
     assert sorted(int(p.name) for p in (run_dir / "snapshots").iterdir()) == [2, 3]
-    policy = checkpoint.load_policy(run_dir / "snapshots" / "2")
-    assert policy.step == 2 and checkpoint.load_policy(run_dir).step == 3
+    policy = policy_lib.load_policy(run_dir / "snapshots" / "2")
+    assert policy.step == 2 and policy_lib.load_policy(run_dir).step == 3
 
 
 @SLOW
@@ -159,7 +161,7 @@ def test_all_give_up_where_that_does_not_help(tmp_path):
         (_, first), second = ended(started(stack, *always), code=1)
     assert "error: the learner" in first and "doctor replay" in first
     assert second == ("", "")
-    config, state = recovery.read_dump(run_dir / recovery.DUMP)
+    config, state = recovery.read_dump(run_dir / files.BAD_STATE)
     assert config.env.num_envs == state.env.time.shape[0] == 16
 
 

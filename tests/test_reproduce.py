@@ -8,9 +8,11 @@ import jax
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, plots, reproduce, runner, runtime
+from kslc_jax import curriculum, files, networks, plots, reproduce, runtime
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import preset
-from kslc_jax.recovery import NumbersError
+from kslc_jax.training import loop
+from kslc_jax.training.recovery import NumbersError
 
 
 @pytest.fixture
@@ -18,9 +20,9 @@ def shipped(tmp_path, monkeypatch):
     """A policy that asks for the default pose, among the shipped ones; it falls at once."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    policy = checkpoint.Policy(config, params, curriculum.init(config), 7)
-    monkeypatch.setattr(checkpoint, "POLICIES", tmp_path)
-    checkpoint.save_policy(policy, tmp_path / "still")
+    policy = policy_lib.Policy(config, params, curriculum.init(config), 7)
+    monkeypatch.setattr(policy_lib, "POLICIES", tmp_path)
+    policy_lib.save_policy(policy, tmp_path / "still")
     return tmp_path / "still"
 
 
@@ -49,7 +51,7 @@ def test_milestones_may_be_half_as_late_again():
 
 @pytest.mark.parametrize(("survival", "code"), [(0.0, 0), (1.0, 1)])
 def test_a_shipped_policy_is_tried_again(shipped, survival, code, capsys):
-    (shipped / reproduce.EVALUATION).write_text(evaluation(survival))
+    (shipped / files.EVALUATION).write_text(evaluation(survival))
     assert reproduce.main(["still"]) == code
     said = capsys.readouterr().out
     assert ("lie outside their band" if code else "all 2 numbers lie within") in said
@@ -66,8 +68,8 @@ def test_nothing_to_compare_with_is_one_line(shipped, capsys):
 
 
 def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
-    (shipped / reproduce.EVALUATION).write_text(evaluation(0.0))
-    (shipped / reproduce.MILESTONES).write_text(json.dumps({"1": 2000}))
+    (shipped / files.EVALUATION).write_text(evaluation(0.0))
+    (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
     asked = []
 
     def fake(args, config, until):
@@ -82,8 +84,8 @@ def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
 @pytest.fixture
 def trained(shipped, monkeypatch):
     """What a training of `shipped` does: begins with train step 1, and ends as told."""
-    (shipped / reproduce.EVALUATION).write_text(evaluation(0.0))
-    (shipped / reproduce.MILESTONES).write_text(json.dumps({"1": 2000}))
+    (shipped / files.EVALUATION).write_text(evaluation(0.0))
+    (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
     outcome = {"steps": 1.0, "raises": None}
 
     def fake(config, run_dir, resume, progress):
@@ -98,7 +100,7 @@ def trained(shipped, monkeypatch):
         (run_dir / "metrics.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
         return types.SimpleNamespace(step=round(outcome["steps"] * config.num_updates))
 
-    monkeypatch.setattr(runner, "train", fake)
+    monkeypatch.setattr(loop, "train", fake)
     return outcome
 
 

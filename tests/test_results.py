@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from kslc_jax import compare, evaluate, plots
-from kslc_jax.checkpoint import POLICIES
+from kslc_jax import compare, plots
+from kslc_jax.evaluation import tables
+from kslc_jax.policy import POLICIES
 
 DOCS = Path(__file__).parents[1] / "docs"
 
@@ -73,7 +74,7 @@ def test_perturbed():
 
 def test_turning_and_side_steps():
     head, *rows = table("Turning and side steps")
-    forms = {label: (name, form) for name, label, form in evaluate.ASIDE}
+    forms = {label: (name, form) for name, label, form in tables.SIDEWAYS_COLUMNS}
     labels = [label.split(": ")[-1] for label, *_ in rows]
     assert labels[:3] == ["survived", "mean vx [m/s]", "mean yaw rate [rad/s]"]
     assert labels[3:] == ["survived", "mean vx [m/s]", "mean vy [m/s]"]

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import physics, randomize, robot
+from kslc_jax import motors, physics, randomize, robot
 
 URDF = json.loads((Path(__file__).parent / "data" / "xbot_l_urdf.json").read_text())
 LEG = ("leg_roll", "leg_yaw", "leg_pitch", "knee", "ankle_pitch", "ankle_roll")
@@ -150,7 +150,7 @@ def test_limits_gains_and_motors(xbot):
 
 
 def test_the_engine_itself_limits_no_torque(xbot):
-    """physics.motor_torque does; the servos are plain kp (ctrl - q) - kd dq."""
+    """motors.motor_torque does; the servos are plain kp (ctrl - q) - kd dq."""
     m = xbot.mj_model
     np.testing.assert_array_equal(m.actuator_biasprm[:, 1], -xbot.kp)
     np.testing.assert_array_equal(m.actuator_gear[:, 0], 1)
@@ -464,8 +464,8 @@ def test_stands_on_its_feet(fidelity):
     data.qpos[2] = 0.885
     dt, impulse = r.mj_model.opt.timestep, 0.0
     for _ in range(round(0.3 / dt)):
-        torque = physics.motor_torque(r, NOMINAL, data.qpos[7:], data.qvel[6:], np.zeros(16), np)
-        data.ctrl[:] = physics.servo_control(r, torque, r.kd, data.qpos[7:], data.qvel[6:])
+        torque = motors.motor_torque(r, NOMINAL, data.qpos[7:], data.qvel[6:], np.zeros(16), np)
+        data.ctrl[:] = motors.servo_control(r, torque, r.kd, data.qpos[7:], data.qvel[6:])
         mujoco.mj_step(r.mj_model, data)
         feet = (data.sensordata[r.sensor(f"{s}_foot_touch")][0] for s in ("left", "right"))
         impulse += dt * sum(feet)

@@ -23,19 +23,12 @@ import pytest
 from rich.console import Console
 
 import kslc_jax
-from kslc_jax import (
-    checkpoint,
-    disk,
-    keeper,
-    learning,
-    run_folder,
-    runner,
-    runtime,
-    train,
-    train_step,
-)
+from kslc_jax import files, learning, runtime, train, train_step
+from kslc_jax import policy as policy_lib
+from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import ConfigError, preset
-from kslc_jax.logs import MetricsFile, Progress
+from kslc_jax.training import checkpoint, checkpoint_process, loop, recorder, run_folder
+from kslc_jax.training.logs import MetricsFile, Progress
 
 DEBUG = ["--preset", "debug"]
 
@@ -180,12 +173,12 @@ def test_killed_run_resumes_with_the_same_numbers(sig, unkilled, tmp_path):
 
 
 def test_first_signal_asks_second_interrupts():
-    with runner._Stop() as stop:
+    with loop._Stop() as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop.requested == "SIGINT"
         signal.raise_signal(signal.SIGTERM)  # the same wish, come by another way
         assert stop.requested == "SIGINT"
-        stop._since -= runner.ONE_WISH
+        stop._since -= loop.SAME_SIGNAL_SECONDS
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
 
@@ -195,9 +188,11 @@ def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
     run_dir = tmp_path / "r"
     old = kslc_jax.load_policy(whole[0])
     old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
-    checkpoint.save_policy(old, tmp_path / "p")
+    policy_lib.save_policy(old, tmp_path / "p")
     init, _ = train_step.make(preset("debug"))
-    begin, origin = runner._starting_from(tmp_path / "p", preset("debug"), init, disk.Disk(), None)
+    begin, origin = loop._starting_from(
+        tmp_path / "p", preset("debug"), init, checkpoint_process.LocalStorage(), None
+    )
     state = begin()
     for a, b in zip(
         jax.tree.leaves(state.learner.params), jax.tree.leaves(old.params), strict=True
@@ -250,7 +245,7 @@ def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
     shutil.rmtree(folders[0])
     args = ["--speeds", "0", "1", "--seeds", "2", "--seconds", "3"]
     assert learning.main([str(run_dir), *args]) == 0
-    points = json.loads((run_dir / learning.LEARNING).read_text())["points"]
+    points = json.loads((run_dir / files.LEARNING).read_text())["points"]
     assert [p["env_steps"] for p in points] == [128 * i for i in range(2, 9)]
     assert all([row["command"] for row in p["rows"]] == [0.0, 1.0] for p in points)
     assert learning.main([str(tmp_path), *args]) == 2
@@ -263,18 +258,18 @@ def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
 def test_snapshots_are_spread_over_the_run(parts, due):
     config = preset("debug")
     config = dataclasses.replace(config, run=dataclasses.replace(config.run, snapshots=parts))
-    assert [s for s in range(1, 9) if keeper.snapshot_due(config, s)] == due
+    assert [s for s in range(1, 9) if recorder.snapshot_due(config, s)] == due
 
 
 def test_a_stop_where_a_snapshot_is_due_keeps_it(tmp_path, monkeypatch):
-    log = keeper.Keeper.log
+    log = recorder.Recorder.log
 
     def stopping(self, metrics, step, took):
         if step == 4:
             signal.raise_signal(signal.SIGTERM)
         return log(self, metrics, step, took)
 
-    monkeypatch.setattr(keeper.Keeper, "log", stopping)
+    monkeypatch.setattr(recorder.Recorder, "log", stopping)
     assert "stopped by SIGTERM at train step 4" in cli(
         *DEBUG, "--run-dir", tmp_path, "--run.snapshots", 4
     )
@@ -369,8 +364,8 @@ class TestErrors:
     def test_damaged_config(self, tmp_path, fails):
         (tmp_path / "config.json").write_text("{")
         assert "config.json is damaged" in fails("--resume", "--run-dir", tmp_path)
-        (tmp_path / "config.json").write_text('{"schema": 1, "seed": 0}')
-        assert "missing field" in fails("--resume", "--run-dir", tmp_path)
+        (tmp_path / "config.json").write_text('{"schema": 1, "seeds": 0}')
+        assert "unknown field seeds" in fails("--resume", "--run-dir", tmp_path)
 
     def test_all_checkpoints_gone(self, whole, tmp_path, fails):
         shutil.copytree(whole[0], tmp_path / "r")
@@ -392,13 +387,13 @@ class TestErrors:
         assert "cannot write" in fails(*DEBUG, "--run-dir", tmp_path / "file" / "r")
 
     def test_policy_not_there(self):
-        with pytest.raises(checkpoint.CheckpointError, match="no run, checkpoint or shipped"):
+        with pytest.raises(CheckpointError, match="no run, checkpoint or shipped"):
             kslc_jax.load_policy("no-such-policy")
 
     def test_damaged_policy(self, whole, tmp_path):
         shutil.copytree(whole[0], tmp_path / "r")
         damage(tmp_path / "r" / "checkpoints" / "8")
-        with pytest.raises(checkpoint.CheckpointError, match="no readable checkpoint"):
+        with pytest.raises(CheckpointError, match="no readable checkpoint"):
             kslc_jax.load_policy(tmp_path / "r")
 
 
@@ -420,7 +415,7 @@ def test_killed_before_its_first_checkpoint(whole, tmp_path, capsys):
 def test_the_first_train_step_is_saved_at_once(tmp_path):
     run = dataclasses.replace(preset("debug").run, steps=256, checkpoint_minutes=60.0)
     config = dataclasses.replace(preset("debug"), run=run)
-    runner.train(config, tmp_path / "r", resume=False, progress=Progress(config))
+    loop.train(config, tmp_path / "r", resume=False, progress=Progress(config))
     assert checkpoint.Store(tmp_path / "r").steps() == [1, 2]
 
 

@@ -9,20 +9,11 @@ import jax
 import numpy as np
 import pytest
 
-import kslc_jax
-from kslc_jax import (
-    checkpoint,
-    curriculum,
-    env,
-    evaluate,
-    gait_metrics,
-    networks,
-    randomize,
-    robot,
-    sim2sim,
-    trials,
-)
+import kslc_jax.evaluation
+from kslc_jax import curriculum, env, networks, randomize, robot, sim2sim
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
+from kslc_jax.evaluation import gait_metrics, measure, trials
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +22,7 @@ def random_policy():
     config = preset("debug")
     config = dataclasses.replace(config, network=dataclasses.replace(config.network, init_mean=1.0))
     params = networks.init(config, jax.random.key(1))
-    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+    return policy_lib.Policy(config, params, curriculum.init(config), 0)
 
 
 @pytest.fixture
@@ -135,10 +126,10 @@ def test_imu_offset_is_an_error_of_roll_and_pitch(random_policy, frozen):
 
 
 def test_a_sweep_too_large_for_memory_goes_speed_by_speed(random_policy, frozen, monkeypatch):
-    monkeypatch.setattr(evaluate, "MOST_SAMPLES", 1)
+    monkeypatch.setattr(measure, "MOST_SAMPLES", 1)
     shares = []
     setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=3.0)
-    rows = evaluate.measure(random_policy, setting, (0.0, 1.0), 1, progress=shares.append)
+    rows = measure.measure(random_policy, setting, (0.0, 1.0), 1, progress=shares.append)
     assert [row["command"] for row in rows] == [0.0, 1.0]
     np.testing.assert_allclose(shares, np.arange(1, 7) / 6)
 
@@ -146,14 +137,14 @@ def test_a_sweep_too_large_for_memory_goes_speed_by_speed(random_policy, frozen,
 def test_report(random_policy, monkeypatch, tmp_path, capsys):
     """One table per condition, a summary, and JSON that holds every row."""
 
-    def measure(policy, setting, speeds, seeds, seed, progress, beside):
-        assert beside == (0.0, 0.0)
+    def fake(policy, setting, speeds, seeds, seed, progress, vy, yaw_rate):
+        assert (vy, yaw_rate) == (0.0, 0.0)
         progress(1.0)
         extra = setting.randomize.base_mass[0]
         return [{"command": v, "survival": 0.5, "forward_mean": v - extra} for v in speeds]
 
-    monkeypatch.setattr(evaluate, "measure", measure)
-    monkeypatch.setattr(checkpoint, "load_policy", lambda path: random_policy)
+    monkeypatch.setattr(measure, "measure", fake)
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: random_policy)
     out = tmp_path / "deep" / "out.json"
     argv = ["p", "--speeds", "1", "2", "--perturb", "payload=0.25", "--latency", "--json", str(out)]
     assert sim2sim.main(argv) == 0
@@ -176,7 +167,7 @@ def test_a_side_step_and_a_turn_are_commanded_with_every_speed(random_policy, mo
     monkeypatch.setattr(trials, "join", lambda pieces: pieces[0])
     found = {"lateral_mean": 0.29, "yaw_rate_mean": -0.98}
     monkeypatch.setattr(gait_metrics, "summary", lambda trace, speed, robot, dt: found)
-    monkeypatch.setattr(checkpoint, "load_policy", lambda path: random_policy)
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: random_policy)
     argv = ["p", "--speeds", "0", "0.5", "--seeds", "2", "--sideways", "0.3", "--turn", "-1"]
     assert sim2sim.main(argv) == 0
     expected = [[0, 0.3, -1], [0, 0.3, -1], [0.5, 0.3, -1], [0.5, 0.3, -1]]
@@ -202,8 +193,8 @@ def test_errors_are_one_line(argv, says, capsys):
 
 
 def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "kslc_jax.drake", None)
-    monkeypatch.delattr(kslc_jax, "drake", raising=False)
+    monkeypatch.setitem(sys.modules, "kslc_jax.evaluation.drake", None)
+    monkeypatch.delattr(kslc_jax.evaluation, "drake", raising=False)
     assert sim2sim.main(["x", "--engine", "drake"]) == 2
     assert "pip install 'kslc_jax[drake]'" in capsys.readouterr().err
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, networks, train_step
+from kslc_jax import checkpoint_format, networks, rollout, train_step
 from kslc_jax.config import preset
 
 
@@ -21,7 +21,7 @@ def made():
 
 def leaves(state):
     """All leaves as numpy; keys as their data."""
-    return [checkpoint.host_array(x) for x in jax.tree.leaves(state)]
+    return [checkpoint_format.host_array(x) for x in jax.tree.leaves(state)]
 
 
 def assert_same(a, b):
@@ -60,9 +60,9 @@ def test_entropy_bonus_fades_with_the_way_that_is_left(made, fades, v_max, coef)
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, entropy_fades=fades))
     state = init()
     curriculum = state.curriculum.replace(v_max=jnp.asarray(v_max))
-    drawn = train_step.drawn(config, state.replace(curriculum=curriculum))
-    assert float(drawn.entropy_coef) == pytest.approx(coef)
-    np.testing.assert_allclose(jnp.exp(drawn.log_std), config.network.init_std, rtol=1e-6)
+    constants = train_step.rollout_constants(config, state.replace(curriculum=curriculum))
+    assert float(constants.entropy_coef) == pytest.approx(coef)
+    np.testing.assert_allclose(jnp.exp(constants.log_std), config.network.init_std, rtol=1e-6)
 
 
 def test_metrics_are_finite_and_named(made):
@@ -88,7 +88,7 @@ def test_gathered_windows_equal_stacked_histories(made):
     curriculum = train_step.curriculum_lib.init(config)
     seen, state, frames, ages = [], envs, [], []
     step = jax.jit(
-        lambda e, k: train_step.rollout(
+        lambda e, k: rollout.collect(
             dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, rollout_steps=1)),
             params,
             e,
@@ -102,7 +102,7 @@ def test_gathered_windows_equal_stacked_histories(made):
         ages.append(state.time)
         state = step(state, jax.random.key(i))
     assert any(bool(jnp.any(a == 0)) for a in ages), "some episode should have restarted"
-    gather = train_step._windows(envs.history, jnp.stack(frames), jnp.stack(ages))
+    gather = rollout.windows(envs.history, jnp.stack(frames), jnp.stack(ages))
     windows = gather(jnp.arange(8 * config.env.num_envs))
     stacked = jnp.stack(seen).reshape(windows.shape)
     np.testing.assert_array_equal(windows, stacked)
@@ -148,7 +148,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     broken from the start."""
     config, init, _ = made
 
-    def update(ppo_config, apply, drawn, learner, samples, key):
+    def update(ppo_config, apply, constants, learner, samples, key):
         return learner, {"samples": samples, "seen": apply(learner.params, samples.index)}
 
     monkeypatch.setattr(train_step.ppo, "update", update)

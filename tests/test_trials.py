@@ -10,18 +10,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import (
-    checkpoint,
-    commands,
-    curriculum,
-    env,
-    evaluate,
-    gait_metrics,
-    networks,
-    observations,
-    trials,
-)
+from kslc_jax import commands, curriculum, env, evaluate, networks, observations
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import HighFidelity, PhysicsConfig, preset
+from kslc_jax.evaluation import gait_metrics, trials
 
 DT = 0.01
 
@@ -31,7 +23,7 @@ def still():
     """A policy that asks for the default pose whatever it sees."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+    return policy_lib.Policy(config, params, curriculum.init(config), 0)
 
 
 @pytest.mark.parametrize("physics", [PhysicsConfig(engine="mujoco"), HighFidelity()])
@@ -57,7 +49,7 @@ def test_commands_hold(still):
     for wanted in ([1.5, 0.0, 0.0], [0.5, -0.3, 0.0], [1.0, 0.0, 0.4]):
         state = env.reset(config, jax.random.key(1), still.curriculum)
         for _ in range(3):
-            state = trials.hold(config, state, jnp.array(wanted))
+            state = trials.with_command(config, state, jnp.array(wanted))
             state, _ = step(config, state, jnp.zeros(16), jax.random.key(2), still.curriculum)
             seen = state.history[-1, at] / np.array([2.0, 2.0, 1.0])
             np.testing.assert_allclose(seen, wanted, atol=0.01)  # what one step turns the robot
@@ -67,7 +59,7 @@ def test_commands_hold(still):
 def test_a_yaw_rate_never_turns_the_other_way(still, rate):
     """A rate of 3 rad/s would ask for a heading 6 rad ahead, which is 0.28 rad behind."""
     state = env.reset(still.config, jax.random.key(1), still.curriculum)
-    held = trials.hold(still.config, state, jnp.array([0.0, 0.0, rate]))
+    held = trials.with_command(still.config, state, jnp.array([0.0, 0.0, rate]))
     steered = commands.steer(still.config.command, held.command, jnp.zeros(()))
     assert float(steered.velocity[2]) == pytest.approx(np.clip(rate, -1.0, 1.0), abs=1e-5)
 
@@ -291,7 +283,7 @@ def test_limbs_turn_with_the_body(xbot):
 
 def test_the_shipped_policy_walks_and_runs():
     """4 s, of which 2 s count: at 3 m/s it is still gathering speed."""
-    policy = checkpoint.load_policy("xbot_l_run")
+    policy = policy_lib.load_policy("xbot_l_run")
     args = evaluate.Args(Path("xbot_l_run"), speeds=(1.0, 3.0), seeds=1, seconds=4.0)
     walk, run = evaluate.sweep(args, policy)
     assert walk["survival"] == run["survival"] == 1.0

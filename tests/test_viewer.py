@@ -18,9 +18,12 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
-import kslc_jax
-from kslc_jax import checkpoint, config, curriculum, networks, play, robot, session, trials
+import kslc_jax.viewer
+from kslc_jax import config, curriculum, files, networks, play, robot
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
+from kslc_jax.evaluation import trials
+from kslc_jax.viewer import session
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
@@ -34,7 +37,7 @@ def still():
     env = dataclasses.replace(base.env, reset_joint_noise=0.0)
     quiet = dataclasses.replace(base, env=env, physics=C_MUJOCO)
     params = jax.tree.map(np.zeros_like, networks.init(quiet, jax.random.key(0)))
-    return checkpoint.Policy(quiet, params, curriculum.init(quiet), 0)
+    return policy_lib.Policy(quiet, params, curriculum.init(quiet), 0)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +51,7 @@ def run_dir(still, tmp_path_factory):
             items = ocp.args.Composite(
                 params=ocp.args.StandardSave(still.params), meta=ocp.args.JsonSave(meta)
             )
-            writer.save(root / checkpoint.FOLDER / step, args=items)
+            writer.save(root / files.CHECKPOINTS / step, args=items)
     return root
 
 
@@ -126,7 +129,9 @@ def volume(model, geom) -> float:
 
 
 def test_meshes_have_the_geoms_size_and_place():
-    viewer = pytest.importorskip("kslc_jax.viewer", reason="the extra 'viewer' is not installed")
+    viewer = pytest.importorskip(
+        "kslc_jax.viewer.app", reason="the extra 'viewer' is not installed"
+    )
     model = robot.load("high").mj_model
     drawn = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     assert len(drawn) > 40
@@ -140,7 +145,7 @@ def test_meshes_have_the_geoms_size_and_place():
 def viewer(run_dir):
     """A viewer on a free port; nothing runs but what a test asks for."""
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
-    from kslc_jax.viewer import Viewer
+    from kslc_jax.viewer.app import Viewer
 
     made = Viewer(run_dir, "train", port=0)
     yield made
@@ -226,7 +231,7 @@ def test_the_page_says_when_it_is_too_slow(viewer, monkeypatch):
 
 def test_policies_of_a_run(run_dir):
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
-    from kslc_jax.viewer import policies
+    from kslc_jax.viewer.app import policies
 
     found = policies(run_dir)
     assert list(found)[:2] == [str(run_dir), "step 2"]
@@ -252,7 +257,7 @@ def test_port_in_use_is_one_line(run_dir, capsys):
 
 
 def test_viewer_not_installed_is_one_line(run_dir, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "kslc_jax.viewer", None)
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.app", None)
     assert play.main([str(run_dir)]) == 2
     err = capsys.readouterr().err.strip().splitlines()
     assert len(err) == 1 and "pip install 'kslc_jax[viewer]'" in err[0]
@@ -289,13 +294,27 @@ def test_caption_writes_into_the_corner():
     assert not written[100:].any() and not written[:, 320:].any()
 
 
+def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot):
+    from kslc_jax.viewer import render
+
+    def fails(*args, **kwargs):
+        raise render.RenderError("no GL")
+
+    monkeypatch.setattr(render, "_renderer", fails)
+    camera = robot.load("high").mj_model.vis.global_
+    before = camera.fovy
+    with pytest.raises(render.RenderError):
+        render.gait_strip(np.tile(xbot.default_qpos, (10, 1)), dt=0.1)
+    assert camera.fovy == before != render.LONG_LENS
+
+
 def test_video_carries_the_speeds(monkeypatch, tmp_path):
     """Two speeds of half a second each at 50 frames a second, with text, drawn without GL."""
     imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
     pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
     blank = SimpleNamespace(frames=lambda qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos))
-    monkeypatch.setitem(sys.modules, "kslc_jax.render", blank)
-    monkeypatch.setattr(kslc_jax, "render", blank, raising=False)
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
+    monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
     said = []
     write = play.caption
     monkeypatch.setattr(play, "caption", lambda p, text: said.append(text) or write(p, text))
@@ -320,8 +339,8 @@ def test_what_is_shown_ends_with_the_fall(fall, steps):
 
 
 def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "kslc_jax.render", SimpleNamespace())
-    monkeypatch.setattr(kslc_jax, "render", SimpleNamespace(), raising=False)
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", SimpleNamespace())
+    monkeypatch.setattr(kslc_jax.viewer, "render", SimpleNamespace(), raising=False)
     monkeypatch.setattr(play, "record", None)
     (tmp_path / "file").touch()
     for name, out in (("gait_strip", "out.png"), ("video", "out.mp4")):
@@ -355,7 +374,7 @@ def test_the_page(run_dir):
     browser_path = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser_path is None:
         pytest.skip(f"none of {', '.join(BROWSERS)} is installed")
-    from kslc_jax.viewer import Viewer
+    from kslc_jax.viewer.app import Viewer
 
     made = Viewer(run_dir, "train", port=0)
     stop = threading.Event()

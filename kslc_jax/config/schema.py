@@ -6,6 +6,8 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
+from kslc_jax.errors import UserError
+
 NUM_JOINTS = 16
 
 Range = tuple[float, float]
@@ -13,7 +15,7 @@ Range = tuple[float, float]
 Fidelity = Literal["train", "high"]
 
 
-class ConfigError(Exception):
+class ConfigError(UserError):
     """A config value that cannot work; the message names the field and the fix."""
 
 

@@ -9,25 +9,7 @@ from kslc_jax.config.schema import Config, require
 
 SCHEMA_VERSION = 1
 
-YOUNGER: dict[str, Any] = {
-    "config.command.slow_fraction": 0.0,
-    "config.command.slow_speed": 1.0,
-    "config.network.init_mean": 1.0,
-    "config.ppo.entropy_fades": False,
-    "config.gait.double_support_at_speed": 0.1,
-    "config.gait.stride_sweep": 0.0,
-    "config.rewards.weights.tracking_mean_vel": 0.0,
-    "config.rewards.clearance_mid_swing": False,
-    "config.rewards.restless": 0.0,
-    "config.rewards.exact_from": 0.5,
-    "config.rewards.exact_full": 2.5,
-    "config.curriculum.gait_threshold": -1.0,
-    "config.randomize.noise": (1.0, 1.0),
-    "config.run.snapshots": 24,
-}
-"""Fields that older files of this version lack, with the values that give the numbers of then."""
-
-RETIRED = {"config.physics.clamp_joint_speed"}
+REMOVED_FIELDS = {"config.physics.clamp_joint_speed"}
 """Fields of older files that nothing reads any more."""
 
 
@@ -37,7 +19,10 @@ def to_dict(config: Config) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any]) -> Config:
-    """Inverse of `to_dict`; ConfigError names a missing, unknown or mistyped field."""
+    """Inverse of `to_dict`; ConfigError names an unknown or mistyped field.
+
+    A field that the file lacks has its default: a new field's default gives the numbers of before.
+    """
     require(isinstance(data, dict), "config: not a JSON object")
     data = dict(data)
     schema = data.pop("schema", None)
@@ -52,14 +37,10 @@ def _build(cls: Any, data: Any, where: str) -> Any:
     require(isinstance(data, dict), f"{where}: expected an object, got {type(data).__name__}")
     resolved = typing.get_type_hints(cls)
     hints = {f.name: resolved[f.name] for f in dataclasses.fields(cls)}
-    data = {n: value for n, value in data.items() if f"{where}.{n}" not in RETIRED}
+    data = {n: value for n, value in data.items() if f"{where}.{n}" not in REMOVED_FIELDS}
     unknown = set(data) - set(hints)
     require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
-    absent = set(hints) - set(data)
-    older = {n: YOUNGER[f"{where}.{n}"] for n in absent if f"{where}.{n}" in YOUNGER}
-    missing = sorted(absent - set(older))
-    require(not missing, f"{where}: missing field {', '.join(missing)}")
-    return cls(**older, **{n: _value(hints[n], data[n], f"{where}.{n}") for n in data})
+    return cls(**{n: _value(hints[n], data[n], f"{where}.{n}") for n in data})
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:

@@ -6,12 +6,14 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, physics, randomize, trials
+from kslc_jax import curriculum, networks, physics, randomize
+from kslc_jax import policy as policy_lib
 from kslc_jax.config import HighFidelity, preset
+from kslc_jax.evaluation import trials
 
 pytest.importorskip("pydrake", reason="Drake is an optional extra")
 
-from kslc_jax import drake
+from kslc_jax.evaluation import drake
 
 CONFIG = HighFidelity()
 NOMINAL = jax.tree.map(np.asarray, randomize.nominal())
@@ -155,7 +157,7 @@ def test_servos_alone_stand_a_second_in_drake():
     """The whole way of a policy: environment, signals, observations, trace."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    still = checkpoint.Policy(config, params, curriculum.init(config), 0)
+    still = policy_lib.Policy(config, params, curriculum.init(config), 0)
     setting = trials.Setting(CONFIG, seconds=1.0, simulate=drake.step)
     trace = trials.join(list(trials.run(still, setting, np.zeros((1, 3)))))
     assert trace.alive[:80].all() and trace.contact[30:80].mean() > 0.9

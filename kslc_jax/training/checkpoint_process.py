@@ -1,4 +1,4 @@
-"""Who reads and writes checkpoints: this process, or, of several, a child of the first.
+"""Checkpoint I/O. With several processes, a child of process 0 does it.
 
 Orbax is part of JAX's cluster: each save and each restore waits for all processes in it, and where
 one fails alone the others wait for ever. So of several processes the first lets a child do it that
@@ -17,14 +17,17 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from kslc_jax import checkpoint, runtime, train_step
-from kslc_jax.checkpoint import CheckpointError, Policy, Store, host_array, typed
+from kslc_jax import policy as policy_lib
+from kslc_jax import runtime, train_step
+from kslc_jax.checkpoint_format import CheckpointError, host_array, typed
 from kslc_jax.config import Config
+from kslc_jax.policy import Policy
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
+from kslc_jax.training.checkpoint import Store
 
 
-class Saves(Protocol):
+class CheckpointStore(Protocol):
     """What a `Store` does for a training."""
 
     def steps(self) -> list[int]: ...
@@ -34,26 +37,26 @@ class Saves(Protocol):
     def close(self) -> None: ...
 
 
-class Disk:
+class LocalStorage:
     """This process does it."""
 
-    def open(self, run_dir: Path, config: Config) -> Saves:
+    def open(self, run_dir: Path, config: Config) -> CheckpointStore:
         """The checkpoints of a run folder."""
         return Store(run_dir, config.run.keep)
 
     def save_policy(self, policy: Policy, folder: Path) -> None:
-        """As `checkpoint.save_policy`."""
-        checkpoint.save_policy(policy, folder)
+        """As `policy_lib.save_policy`."""
+        policy_lib.save_policy(policy, folder)
 
     def load_policy(self, path: Path) -> Policy:
-        """As `checkpoint.load_policy`."""
-        return checkpoint.load_policy(path)
+        """As `policy_lib.load_policy`."""
+        return policy_lib.load_policy(path)
 
     def close(self) -> None:
         """Lets go."""
 
 
-class DiskProcess(Disk):
+class ChildProcessStorage(LocalStorage):
     """A child does it; what it meets is raised here."""
 
     def __init__(self) -> None:
@@ -63,7 +66,7 @@ class DiskProcess(Disk):
         self._process.start()
         theirs.close()
 
-    def open(self, run_dir: Path, config: Config) -> Saves:
+    def open(self, run_dir: Path, config: Config) -> CheckpointStore:
         self._ask("open", run_dir, config)
         return self
 
@@ -113,7 +116,7 @@ def _on_host(policy: Policy) -> Policy:
 class _Server:
     """What the child does, by the name of what it is asked for."""
 
-    save_policy = staticmethod(checkpoint.save_policy)
+    save_policy = staticmethod(policy_lib.save_policy)
 
     def open(self, run_dir: Path, config: Config) -> None:
         self.store = Store(run_dir, config.run.keep)
@@ -134,12 +137,13 @@ class _Server:
         return jax.tree.map(host_array, state), warnings
 
     def load_policy(self, path: Path) -> Policy:
-        return _on_host(checkpoint.load_policy(path))
+        return _on_host(policy_lib.load_policy(path))
 
 
 def _serve(pipe: Connection) -> None:
     """The child: answers until the other end is closed, be it by the other's death."""
-    runtime.prepare()
+    runtime.prepare(gl=False)
+    runtime.quiet()
     jax.config.update("jax_platforms", "cpu")  # the accelerator is the training's
     for number in (signal.SIGINT, signal.SIGTERM):  # a terminal sends them to both
         signal.signal(number, signal.SIG_IGN)

@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 from scipy.special import stdtrit
 
+from kslc_jax.evaluation.trials import Trace
 from kslc_jax.robot import Robot
-from kslc_jax.trials import Trace
 
 GRAVITY = 9.81
 SETTLE = 2.0

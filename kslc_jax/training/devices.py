@@ -25,8 +25,9 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from orbax.checkpoint import multihost
 
 from kslc_jax import physics, train_step
-from kslc_jax.checkpoint import host_array, is_key, typed
+from kslc_jax.checkpoint_format import host_array, is_key, typed
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import Metrics, TrainState
 
@@ -53,7 +54,7 @@ def join(
       ConfigError: it is not to be.
     """
     with contextlib.suppress(AttributeError):  # older ones have no such switch
-        jax.config.update("jax_enable_preemption_service", False)  # SIGTERM is the runner's
+        jax.config.update("jax_enable_preemption_service", False)  # the loop handles SIGTERM
     try:
         jax.distributed.initialize(coordinator, processes, index)
     except (RuntimeError, ValueError, OSError) as error:
@@ -134,12 +135,12 @@ def make(
 ) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
     """`train_step.make` over a mesh: (init, train_step), both jitted; train_step donates."""
 
-    def spread(index: jax.Array) -> jax.Array:
+    def shard_index(index: jax.Array) -> jax.Array:
         split = NamedSharding(mesh, PartitionSpec(AXIS))
         return jax.lax.with_sharding_constraint(index, split)
 
     def step(state: TrainState) -> tuple[TrainState, Metrics]:
-        return train_step.step(config, state, spread)
+        return train_step.step(config, state, shard_index)
 
     placed = shardings(mesh, jax.eval_shape(lambda: train_step.init(config, 0)))
     everywhere: Any = NamedSharding(mesh, PartitionSpec())
@@ -153,7 +154,7 @@ def make(
 # ------------------------------------------------------------------------------- several processes
 
 
-class Elsewhere(RuntimeError):
+class Elsewhere(UserError):
     """Another process gave up, and says why."""
 
 

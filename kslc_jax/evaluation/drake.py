@@ -129,7 +129,7 @@ def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> N
     """Bodies, hinges and motors, in the robot's joint order.
 
     The servos' damping goes into the joints, which Drake integrates implicitly: all of it, where
-    MuJoCo is given `physics.motor_damping`.
+    MuJoCo is given `motors.motor_damping`.
     """
     for i in range(1, model.nbody):
         plant.AddRigidBody(model.body(i).name, _inertia(model, i))
@@ -251,8 +251,8 @@ def advance(
         for i in range(steps):
             qpos, qvel = get_state(world)
             q, dq = qpos[7:], qvel[6:]
-            torque = physics.motor_torque(robot, dynamics, q, dq, target, np)
-            passive = -joint_friction * np.tanh(dq / physics.FRICTION_SPEED)
+            torque = motors.motor_torque(robot, dynamics, q, dq, target, np)
+            passive = -joint_friction * np.tanh(dq / motors.FRICTION_SPEED)
             motors.FixValue(world.plant_context, torque + passive + robot.kd * dq)
             if i == steps - 1:
                 forces = foot_forces(world)

@@ -11,24 +11,22 @@ import shlex
 import subprocess
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import jax
 
-from kslc_jax import checkpoint
 from kslc_jax import config as config_lib
+from kslc_jax import files
+from kslc_jax.checkpoint_format import has_checkpoints
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.files import write_whole
-from kslc_jax.logs import rows_written
+from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
+from kslc_jax.training.logs import rows_written
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-CONFIG, VERSIONS = "config.json", "versions.json"
-"""The files' names in a run folder."""
-
-
-class RunError(RuntimeError):
+class RunError(UserError):
     """A run folder that cannot be used; the message says why and what to do."""
 
 
@@ -69,7 +67,7 @@ def locked(run_dir: Path) -> Generator[None]:
     """Holds the run folder's lock, which the system takes back at the process's death; RunError
     with the other's process id if another process holds it."""
     with writing(run_dir):
-        file = (run_dir / ".lock").open("a+")
+        file = (run_dir / files.LOCK).open("a+")
     with file:
         with writing(run_dir):
             try:
@@ -90,24 +88,32 @@ def open_folder(run_dir: Path, config: Config, resume: bool, origin: dict[str, s
     A training that ended before its first train step was saved has left nothing to lose."""
     if resume:
         difference(read_config(run_dir), config)
-    elif checkpoint.has_checkpoints(run_dir) or rows_written(run_dir) > 1:
+    elif has_checkpoints(run_dir) or rows_written(run_dir) > 1:
         raise RunError(
             f"{run_dir} already holds a training: go on with --resume --run-dir "
             f"{shlex.quote(str(run_dir))}, or name another --run-dir"
         )
     with writing(run_dir):
         if not resume:
-            write_whole(run_dir / VERSIONS, json.dumps(versions() | origin, indent=1))
-        write_whole(run_dir / CONFIG, json.dumps(config_lib.to_dict(config), indent=1))
+            files.write_atomically(
+                run_dir / files.VERSIONS, json.dumps(versions() | origin, indent=1)
+            )
+        files.write_atomically(
+            run_dir / files.CONFIG, json.dumps(config_lib.to_dict(config), indent=1)
+        )
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    files.write_atomically(path, json.dumps(content, indent=1))
 
 
 def read_config(run_dir: Path) -> Config:
     """The config stored in a run folder; RunError if there is none, ConfigError if damaged."""
-    path = run_dir / CONFIG
+    path = run_dir / files.CONFIG
     try:
         return config_lib.from_dict(json.loads(path.read_text()))
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise RunError(f"{run_dir} holds no training to resume (no {CONFIG})") from error
+        raise RunError(f"{run_dir} holds no training to resume (no {files.CONFIG})") from error
     except OSError as error:
         raise RunError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # no JSON, or no text

@@ -1,6 +1,6 @@
 """What the host keeps of a training: metrics, checkpoints, and policies on the way.
 
-Of several processes the first alone does; the others have an `Onlooker` in its place, so that the
+Of several processes only the first keeps anything; the others have a `NullRecorder`, so that the
 loop reads the same.
 """
 
@@ -11,18 +11,21 @@ import time
 from collections.abc import Callable, Generator
 from pathlib import Path
 
-from kslc_jax import checkpoint
-from kslc_jax.checkpoint import BEST_METRIC, CheckpointError, Policy
+from kslc_jax import files, policy
+from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import Config
-from kslc_jax.disk import Saves
-from kslc_jax.logs import MetricsFile, Progress
-from kslc_jax.run_folder import writing
+from kslc_jax.policy import Policy
 from kslc_jax.train_step import TrainState
+from kslc_jax.training import checkpoint
+from kslc_jax.training.checkpoint import BEST_METRIC
+from kslc_jax.training.checkpoint_process import CheckpointStore
+from kslc_jax.training.logs import MetricsFile, Progress
+from kslc_jax.training.run_folder import writing
 
 Record = dict[str, float]
 
 
-class Onlooker:
+class NullRecorder:
     """Keeps nothing."""
 
     def at(self, step: int) -> contextlib.AbstractContextManager[None]:
@@ -49,7 +52,7 @@ class Onlooker:
         """Writes a checkpoint in the background."""
 
     def keep_snapshot(self, state: TrainState) -> None:
-        """Saves the policy alone."""
+        """CheckpointStore the policy alone."""
 
     def drop_snapshots(self, after: int) -> None:
         """Removes policies of train steps that a training went back behind."""
@@ -61,7 +64,7 @@ class Onlooker:
         """Writes the last checkpoint and waits for it."""
 
 
-class Keeper(Onlooker):
+class Recorder(NullRecorder):
     """Keeps everything of one run folder, and shows it.
 
     A failed save must not end hours of training: it is told, and the next one tries again. Only
@@ -72,9 +75,9 @@ class Keeper(Onlooker):
         self,
         config: Config,
         run_dir: Path,
-        store: Saves,
+        store: CheckpointStore,
         progress: Progress,
-        save_policy: Callable[[Policy, Path], None] = checkpoint.save_policy,
+        save_policy: Callable[[Policy, Path], None] = policy.save_policy,
     ):
         self._config, self._run_dir, self._store = config, run_dir, store
         self._progress, self._save_policy = progress, save_policy
@@ -122,13 +125,13 @@ class Keeper(Onlooker):
 
     def keep_snapshot(self, state: TrainState) -> None:
         """One that is there, from before a resume, stays."""
-        folder = self._run_dir / checkpoint.SNAPSHOTS / str(int(state.step))
+        folder = self._run_dir / files.SNAPSHOTS / str(int(state.step))
         with self._going_on():
             if not folder.exists():
                 self._save_policy(checkpoint.policy_of(self._config, state), folder)
 
     def drop_snapshots(self, after: int) -> None:
-        for folder in (self._run_dir / checkpoint.SNAPSHOTS).glob("[0-9]*"):
+        for folder in (self._run_dir / files.SNAPSHOTS).glob("[0-9]*"):
             if folder.name.isdigit() and int(folder.name) > after:
                 shutil.rmtree(folder, ignore_errors=True)
 

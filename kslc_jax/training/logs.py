@@ -16,11 +16,8 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2
 from tensorboardX.summary import Summary
 
+from kslc_jax import files
 from kslc_jax.config import Config
-from kslc_jax.files import write_whole
-
-METRICS = "metrics.jsonl"
-"""The file's name in a run folder."""
 
 PLAIN_SECONDS = 10.0
 """Seconds between progress lines where the output is no terminal."""
@@ -28,7 +25,7 @@ PLAIN_SECONDS = 10.0
 
 def rows_written(run_dir: Path) -> int:
     """Records in a run folder's metrics.jsonl."""
-    path = run_dir / METRICS
+    path = run_dir / files.METRICS
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
@@ -40,19 +37,19 @@ class MetricsFile:
     """
 
     def __init__(self, run_dir: Path, after: int = 0, warn: Callable[[str], None] = print):
-        self.path = run_dir / METRICS
+        self.path = run_dir / files.METRICS
         self.seconds_before = 0.0
         """Wall time [s] that the kept records have seen."""
         kept = []
         if self.path.exists():
             lines = self.path.read_text(errors="replace").splitlines()
             kept = [line for line in lines if _step(line) <= after]
-            write_whole(self.path, "".join(f"{line}\n" for line in kept))
+            files.write_atomically(self.path, "".join(f"{line}\n" for line in kept))
         last = json.loads(kept[-1]) if kept else {}
         self.seconds_before = last.get("seconds", 0.0)
         self._file = self.path.open("ab", buffering=0)
         self._waiting = b""
-        self._board = _Board(run_dir / "tensorboard", int(last.get("env_steps", 0)))
+        self._board = _Board(run_dir / files.TENSORBOARD, int(last.get("env_steps", 0)))
         self._warn, self._full = warn, False
 
     def write(self, record: dict[str, float]) -> None:

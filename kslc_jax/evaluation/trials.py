@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax import commands, env, networks, observations, physics, signals
-from kslc_jax.checkpoint import Policy
 from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.policy import Policy
 
 NOMINAL = RandomizeConfig(
     friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0
@@ -83,7 +83,7 @@ def trial_config(config: Config, setting: Setting, count: int) -> Config:
     )
 
 
-def hold(
+def with_command(
     config: Config, state: env.EnvState, velocity: jax.Array, heading: jax.Array | float = 0.0
 ) -> env.EnvState:
     """The environment under the command `velocity` [3]: vx, vy [m/s], yaw rate [rad/s].
@@ -138,7 +138,7 @@ def _programs(trained: Config, setting: Setting, count: int, step: Callable):
 
     def one(policy: Policy, wanted: jax.Array, carry, key: jax.Array):
         state, alive, last_action = carry
-        state = jax.vmap(lambda s, v: hold(config, s, v))(state, wanted)
+        state = jax.vmap(lambda s, v: with_command(config, s, v))(state, wanted)
         action = jax.vmap(policy.act_on)(state.history + error)
         sent = last_action if setting.latency else action
         keys = jax.random.split(key, count)

@@ -20,19 +20,20 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
-from kslc_jax import devices, memory, physics, profiling, recovery, train_step
+from kslc_jax import files, physics, train_step
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.disk import Disk, DiskProcess
-from kslc_jax.keeper import Keeper, Onlooker, Record, snapshot_due
-from kslc_jax.logs import Progress
 from kslc_jax.networks import Params
-from kslc_jax.recovery import Health, WentBad
-from kslc_jax.run_folder import locked, open_folder, writing
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
+from kslc_jax.training import devices, memory, profiling, recovery
+from kslc_jax.training.checkpoint_process import ChildProcessStorage, LocalStorage
+from kslc_jax.training.logs import Progress
+from kslc_jax.training.recorder import NullRecorder, Record, Recorder, snapshot_due
+from kslc_jax.training.recovery import NonFiniteState, NumbersError, NumericsCheck
+from kslc_jax.training.run_folder import locked, open_folder, writing
 
-ONE_WISH = 1.0
+SAME_SIGNAL_SECONDS = 1.0
 """Seconds within which signals count as one: a scheduler that signals every process of a job tells
 a training twice, itself and by way of what started it."""
 
@@ -55,7 +56,7 @@ class _Stop:
     def _handle(self, number: int, _: FrameType | None) -> None:
         if not self.requested:
             self.requested, self._since = signal.Signals(number).name, time.monotonic()
-        elif time.monotonic() - self._since > ONE_WISH:  # a second one means now
+        elif time.monotonic() - self._since > SAME_SIGNAL_SECONDS:  # a second one means now
             raise KeyboardInterrupt
 
 
@@ -68,7 +69,7 @@ class _Job:
     resume: bool
     mesh: Mesh | None
     progress: Progress
-    keeper: Onlooker
+    recorder: NullRecorder
     profile: profiling.Profile
     like: TrainState  # shapes
     init: Callable[[], TrainState]
@@ -76,7 +77,7 @@ class _Job:
 
     def restored(self) -> TrainState:
         """The latest whole checkpoint, on its devices."""
-        state = devices.from_first(lambda: self.keeper.restore(self.like), self.like)
+        state = devices.from_first(lambda: self.recorder.restore(self.like), self.like)
         return state if self.mesh is None else devices.place(self.mesh, state)
 
 
@@ -107,38 +108,42 @@ def train(
     """
     init, step = train_step.make(config) if mesh is None else devices.make(config, mesh)
     like = jax.eval_shape(init)
-    memory.check(config, like, 1 if mesh is None else mesh.size)
+    memory.check(config, 1 if mesh is None else mesh.size)
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(progress))
-        disk = DiskProcess() if devices.several() and devices.is_first() else Disk()
-        stack.enter_context(contextlib.closing(disk))
+        storage = (
+            ChildProcessStorage() if devices.several() and devices.is_first() else LocalStorage()
+        )
+        stack.enter_context(contextlib.closing(storage))
         origin: dict[str, str] = {}
         if start_from is not None:
-            init, origin = _starting_from(start_from, config, init, disk, mesh)
-        keeper = devices.on_first(
-            lambda: stack.enter_context(_keeper(config, run_dir, resume, origin, progress, disk))
+            init, origin = _starting_from(start_from, config, init, storage, mesh)
+        recorder = devices.on_first(
+            lambda: stack.enter_context(
+                _recorder(config, run_dir, resume, origin, progress, storage)
+            )
         )
         tracing = profiling.Profile(
-            run_dir / profiling.FOLDER,
+            run_dir / files.PROFILE,
             profile if devices.is_first() else 0,
             progress.say,
             progress.warn,
         )
-        kept = keeper or Onlooker()
-        return _persist(
+        kept = recorder or NullRecorder()
+        return _train(
             _Job(config, run_dir, resume, mesh, progress, kept, tracing, like, init, step)
         )
 
 
 @contextlib.contextmanager
-def _keeper(
+def _recorder(
     config: Config,
     run_dir: Path,
     resume: bool,
     origin: dict[str, str],
     progress: Progress,
-    disk: Disk,
-) -> Generator[Keeper]:
+    storage: LocalStorage,
+) -> Generator[Recorder]:
     """Opens the run folder, which is this process's alone meanwhile."""
     if not resume:
         with writing(run_dir):
@@ -146,13 +151,17 @@ def _keeper(
     with locked(run_dir):
         open_folder(run_dir, config, resume, origin)
         with writing(run_dir):
-            store = disk.open(run_dir, config)
+            store = storage.open(run_dir, config)
         with contextlib.closing(store):
-            yield Keeper(config, run_dir, store, progress, disk.save_policy)
+            yield Recorder(config, run_dir, store, progress, storage.save_policy)
 
 
 def _starting_from(
-    path: Path, config: Config, init: Callable[[], TrainState], disk: Disk, mesh: Mesh | None
+    path: Path,
+    config: Config,
+    init: Callable[[], TrainState],
+    storage: LocalStorage,
+    mesh: Mesh | None,
 ) -> tuple[Callable[[], TrainState], dict[str, str]]:
     """`init` with a policy's networks and curriculum, and where they come from."""
     start = functools.partial(train_step.start_from, config)
@@ -161,7 +170,7 @@ def _starting_from(
 
     def chosen() -> tuple[Params, Curriculum]:
         nonlocal step
-        policy = disk.load_policy(path)
+        policy = storage.load_policy(path)
         step = policy.step
         try:
             jax.eval_shape(start, like, policy.params, policy.curriculum)
@@ -181,8 +190,8 @@ def _starting_from(
     return begin, {"start_from": f"{path}, train step {step}"}
 
 
-def _persist(job: _Job) -> TrainState:
-    """Compiles and trains; goes back to a checkpoint where numbers go bad."""
+def _train(job: _Job) -> TrainState:
+    """Compiles and trains; goes back to a checkpoint where numbers are not finite."""
     start = time.monotonic()
     state = job.restored() if job.resume else job.init()
     if job.resume:
@@ -191,54 +200,79 @@ def _persist(job: _Job) -> TrainState:
     seconds, need = time.monotonic() - start, memory.measured(compiled)
     needs = f", needs {memory.shown(need)}" if need else ""
     job.progress.say(f"compiled in {seconds:.0f} s{needs}; training")
-
-    def again() -> TrainState:
-        job.keeper.settle()
-        (there,) = devices.agree(job.keeper.has_checkpoints())
-        state = job.restored() if there else job.init()
-        job.keeper.drop_snapshots(int(state.step))
-        return state
-
-    def go(state: TrainState) -> TrainState:
-        try:
-            return _loop(job, state, compiled)
-        except WentBad as bad:  # it may have to be written down
-            raise WentBad(str(bad), devices.whole(bad.before)) from bad
-
+    attempt, back_to = 0, -1
     with contextlib.closing(job.profile):
+        while True:
+            try:
+                return _loop(job, state, compiled)
+            except NonFiniteState as bad:
+                state, attempt = _go_back(job, bad, attempt, back_to)
+                back_to = int(state.step)
+
+
+def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tuple[TrainState, int]:
+    """The state of the last checkpoint with a lower learning rate, and the number of this attempt
+    from there; `attempt` is the number of the last one, from train step `back_to`.
+
+    Raises:
+      NumbersError: all attempts from there failed; the message says what is left to look at.
+    """
+    before = devices.whole(bad.before)
+    state = _last_good(job)
+    attempt = attempt + 1 if int(state.step) == back_to else 1
+    if attempt > recovery.ATTEMPTS:
         folder = job.run_dir if devices.is_first() else Path(os.devnull)
-        return recovery.persist(job.config, folder, go, state, again, job.progress.warn)
+        left = recovery.leave(job.config, folder / files.BAD_STATE, before)
+        raise NumbersError(
+            f"{bad}, also after {recovery.ATTEMPTS} attempts from train step {back_to} with lower "
+            f"learning rates; {left}"
+        ) from bad
+    state = recovery.with_lower_rate(state, attempt)
+    job.progress.warn(
+        f"{bad}; back to train step {int(state.step)} with learning rate "
+        f"{float(state.learner.learning_rate):.2g} (attempt {attempt} of {recovery.ATTEMPTS})"
+    )
+    return state, attempt
+
+
+def _last_good(job: _Job) -> TrainState:
+    """The state of the last checkpoint, or the first state where there is none."""
+    job.recorder.settle()
+    (there,) = devices.agree(job.recorder.has_checkpoints())
+    state = job.restored() if there else job.init()
+    job.recorder.drop_snapshots(int(state.step))
+    return state
 
 
 def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
     """Steps; returns the last state, which is kept."""
     first = int(state.step)
     record: Record = {}
-    health, watchdog = Health(state), Watchdog()
+    numerics, watchdog = NumericsCheck(state), Watchdog()
     with _Stop() as stop, contextlib.ExitStack() as opened:
-        devices.on_first(lambda: opened.enter_context(job.keeper.at(first)))
+        devices.on_first(lambda: opened.enter_context(job.recorder.at(first)))
         for step in range(first + 1, job.config.num_updates + 1):
-            health.before(state)
+            numerics.before(state)
             with job.profile.step(step), watchdog.step():
                 tick = time.monotonic()
                 state, metrics = step_fn(state)
                 record = {name: float(value) for name, value in jax.device_get(metrics).items()}
                 took = time.monotonic() - tick
-            record = job.keeper.log(record, step, took)
-            health.after(record)
-            if health.good and snapshot_due(job.config, step):
-                job.keeper.keep_snapshot(state)
-            stopped, due = devices.agree(stop.requested is not None, job.keeper.due())
+            record = job.recorder.log(record, step, took)
+            numerics.after(record)
+            if numerics.good and snapshot_due(job.config, step):
+                job.recorder.keep_snapshot(state)
+            stopped, due = devices.agree(stop.requested is not None, job.recorder.due())
             if stopped:
                 stop.requested = stop.requested or "a signal to another process"
                 break
-            health.check()
-            if health.good and due:
-                job.keeper.save(devices.whole(state), record)
-        if record and health.finite:
+            numerics.require_good()
+            if numerics.good and due:
+                job.recorder.save(devices.whole(state), record)
+        if record and numerics.finite:
             last = devices.whole(state)
-            devices.on_first(lambda: job.keeper.finish(last, record))
-    _farewell(job, int(state.step), stop.requested, health.finite)
+            devices.on_first(lambda: job.recorder.finish(last, record))
+    _farewell(job, int(state.step), stop.requested, numerics.finite)
     return state
 
 
@@ -261,8 +295,7 @@ def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
     on = kind if jax.device_count() == 1 else f"{count} of {jax.device_count()} devices ({kind})"
     if devices.several():
         on += f", {jax.process_count()} processes"
-    like = jax.eval_shape(lambda: train_step.init(config, 0))
-    need = memory.estimate(config, like, count)
+    need = memory.estimate(config, count)
     return (
         f"{n} environments x {t} steps = {config.batch_size} samples an update, "
         f"{config.run.steps / 1e6:.2f}M steps in all; engine {engine} on {on}, about "

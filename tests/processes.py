@@ -22,7 +22,7 @@ METRICS = dict.fromkeys(
     ],
     0.5,
 )
-"""As a train step gives them, as far as runner, keeper and progress read them."""
+"""As a train step gives them, as far as loop, recorder and progress read them."""
 
 
 def command(*args: Any, forced: int) -> dict[str, Any]:
@@ -47,19 +47,19 @@ def started(stack: contextlib.ExitStack, *args: Any, processes: int = 2, forced:
     """Processes of one training, of `forced` devices each; killed with the stack's end."""
     options = ["--coordinator", f"127.0.0.1:{free_port()}", "--processes", processes]
     options += ["--devices", forced, "--process-index"]
-    children = []
+    running = []
     for index in range(processes):
-        child = subprocess.Popen(**command(*args, *options, index, forced=forced))
-        children.append(stack.enter_context(child))
-        stack.callback(child.kill)
-    return children
+        process = subprocess.Popen(**command(*args, *options, index, forced=forced))
+        running.append(stack.enter_context(process))
+        stack.callback(process.kill)
+    return running
 
 
-def ended(children: list, code: int = 0, within: float = 5000.0) -> list[tuple[str, str]]:
+def ended(processes: list, code: int = 0, within: float = 5000.0) -> list[tuple[str, str]]:
     """What they say on (stdout, stderr), once all have ended with this exit code; without what
     XLA's way between CPUs prints."""
-    said = [child.communicate(timeout=within) for child in children]
-    assert [child.returncode for child in children] == [code] * len(children), said
+    said = [process.communicate(timeout=within) for process in processes]
+    assert [process.returncode for process in processes] == [code] * len(processes), said
     return [(re.sub(r"(?m)^\[Gloo\].*\n", "", out), err) for out, err in said]
 
 
@@ -75,10 +75,10 @@ def rows(run_dir: Path) -> list[dict[str, float]]:
     return [json.loads(row) for row in (run_dir / "metrics.jsonl").read_text().splitlines()]
 
 
-def wait_for_rows(run_dir: Path, count: int, children: list) -> None:
+def wait_for_rows(run_dir: Path, count: int, processes: list) -> None:
     for _ in range(50000):
         if (run_dir / "metrics.jsonl").exists() and len(rows(run_dir)) >= count:
             return
-        assert all(child.poll() is None for child in children), children[0].communicate()
+        assert all(process.poll() is None for process in processes), processes[0].communicate()
         time.sleep(0.1)
     raise AssertionError("no progress")

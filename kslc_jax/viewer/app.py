@@ -19,11 +19,14 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from kslc_jax import checkpoint, panel, trials
+from kslc_jax import policy as policy_lib
 from kslc_jax import robot as robot_lib
-from kslc_jax.checkpoint import CheckpointError, Policy, load_policy
+from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import ConfigError, Fidelity
-from kslc_jax.session import Pacer, Session, View
+from kslc_jax.evaluation import trials
+from kslc_jax.policy import Policy, load_policy
+from kslc_jax.viewer import panel
+from kslc_jax.viewer.session import Pacer, Session, View
 
 FPS = 30
 PANEL_HZ = 10
@@ -133,12 +136,12 @@ class Figure:
 
 def policies(given: Path) -> dict[str, Path]:
     """Name to folder: the given policy, its run's other checkpoints, and the shipped ones."""
-    folder = checkpoint.checkpoint_folder(given)
+    folder = policy_lib.checkpoint_folder(given)
     found = {str(given): folder}
     others = [p for p in folder.parent.iterdir() if p.name.isdigit() and p != folder]
     for other in sorted(others, key=lambda p: -int(p.name)):
         found[f"step {other.name}"] = other
-    for shipped in sorted(checkpoint.POLICIES.glob("*/")):
+    for shipped in sorted(policy_lib.POLICIES.glob("*/")):
         found.setdefault(shipped.name, shipped)
     return found
 

@@ -6,9 +6,6 @@ from pathlib import Path
 
 import jax
 
-FOLDER = "profile"
-"""The folder's name in a run folder."""
-
 trace = jax.profiler.trace
 """trace(folder): traces what runs within, on host and devices, into a new subfolder."""
 

@@ -8,9 +8,9 @@ import numpy as np
 import viser
 from viser.uplot import Axis, Legend, Scale, Series
 
-from kslc_jax.checkpoint import Policy
 from kslc_jax.config import CommandConfig
-from kslc_jax.session import View
+from kslc_jax.policy import Policy
+from kslc_jax.viewer.session import View
 
 MARGIN = 0.5
 """How far [m/s] the slider of vx goes backwards, and beyond the trained range."""

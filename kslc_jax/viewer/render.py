@@ -1,42 +1,18 @@
 """Pictures of recorded motion: gait strips and videos, rendered off screen.
 
-Import this module before anything that imports mujoco: it picks the GL backend, which mujoco reads
-once, when it is first imported.
+Call `runtime.prepare()` before anything that imports mujoco: it chooses the GL library.
 """
 
-import ctypes.util
+import contextlib
 import os
-import sys
+from collections.abc import Generator, Iterator, Sequence
 
-_BACKENDS = {"egl": "EGL", "osmesa": "OSMesa"}
+import mujoco
+import numpy as np
 
-
-class RenderError(ImportError):
-    """No way to render on this machine; the message says what to install."""
-
-
-def choose_backend() -> None:
-    """Sets MUJOCO_GL to EGL or else OSMesa, unless the user has set it; RenderError if neither."""
-    if os.environ.get("MUJOCO_GL"):
-        return
-    if "mujoco" in sys.modules:
-        raise RenderError("set MUJOCO_GL=egl or osmesa: mujoco was imported before the renderer")
-    for backend, library in _BACKENDS.items():
-        if ctypes.util.find_library(library):
-            os.environ["MUJOCO_GL"] = backend
-            return
-    raise RenderError("no off-screen GL: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6)")
-
-
-choose_backend()
-
-from collections.abc import Iterator, Sequence  # noqa: E402
-
-import mujoco  # noqa: E402
-import numpy as np  # noqa: E402
-
-from kslc_jax import robot as robot_lib  # noqa: E402
-from kslc_jax.runtime import first_line  # noqa: E402
+from kslc_jax import robot as robot_lib
+from kslc_jax.errors import MissingPackage
+from kslc_jax.runtime import first_line
 
 LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
@@ -45,13 +21,23 @@ TALL = 2.0
 """Height that a gait strip shows at least [m]."""
 
 
+class RenderError(MissingPackage):
+    """No way to draw on this machine; the message says what to install or to set."""
+
+
 def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mujoco.Renderer:
-    """An off-screen renderer; RenderError where the chosen GL is there but does not work."""
+    """An off-screen renderer; RenderError where no GL was chosen, or it does not work."""
+    chosen = os.environ.get("MUJOCO_GL")
+    if not chosen:
+        raise RenderError(
+            "no off-screen GL: apt-get install libegl1 libgl1-mesa-dri (or libosmesa6), and call "
+            "runtime.prepare() before mujoco is imported"
+        )
     try:
         return mujoco.Renderer(model, height, width, **more)
     except Exception as error:  # each GL fails in its own way
         raise RenderError(
-            f"MUJOCO_GL={os.environ['MUJOCO_GL']} does not work here ({first_line(error)}); "
+            f"MUJOCO_GL={chosen} does not work here ({first_line(error)}); "
             "try the other of egl and osmesa"
         ) from error
 
@@ -91,8 +77,8 @@ def gait_strip(
     cam.distance = 0.5 * max(length * height / width, TALL) / half_height
     cam.lookat[:] = [middle, shown[:, 1].mean(), 0.8]
     data = mujoco.MjData(model)
-    fovy, model.vis.global_.fovy = model.vis.global_.fovy, LONG_LENS
-    with _renderer(model, height, width, max_geom=20_000) as renderer:
+    lens = _field_of_view(model, LONG_LENS)
+    with lens, _renderer(model, height, width, max_geom=20_000) as renderer:
         for i, q in enumerate(shown):
             data.qpos[:] = q
             mujoco.mj_forward(model, data)
@@ -107,9 +93,17 @@ def gait_strip(
                 mujoco.mjtCatBit.mjCAT_DYNAMIC,
                 renderer.scene,
             )
-        picture = renderer.render()
-    model.vis.global_.fovy = fovy
-    return picture
+        return renderer.render()
+
+
+@contextlib.contextmanager
+def _field_of_view(model: mujoco.MjModel, degrees: float) -> Generator[None]:
+    """Gives the model's camera this vertical field of view within the block."""
+    before, model.vis.global_.fovy = model.vis.global_.fovy, degrees
+    try:
+        yield
+    finally:
+        model.vis.global_.fovy = before
 
 
 def stack(pictures: Sequence[np.ndarray]) -> np.ndarray:

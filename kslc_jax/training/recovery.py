@@ -6,7 +6,6 @@ about what that cannot mend: updates that are never finite, parameters that are 
 
 import json
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,9 @@ import numpy as np
 
 from kslc_jax import config as config_lib
 from kslc_jax import train_step
-from kslc_jax.checkpoint import CheckpointError, host_array, typed
+from kslc_jax.checkpoint_format import CheckpointError, host_array, typed
 from kslc_jax.config import Config
+from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
@@ -33,16 +33,15 @@ ATTEMPTS = 3
 CAUTION = 0.5
 """Factor on the learning rate at each of them."""
 
-DUMP = "bad_state.npz"
-"""File in the run folder: the state before the first bad train step of the last attempt."""
 
-
-class NumbersError(RuntimeError):
+class NumbersError(UserError):
     """Numbers that go bad however often the training goes back."""
 
+    exit_code = 1
 
-class WentBad(Exception):
-    """What is wrong, and the state before the first train step that had it."""
+
+class NonFiniteState(Exception):
+    """Carries what is wrong, and the state before the first bad train step."""
 
     def __init__(self, why: str, before: TrainState):
         super().__init__(why)
@@ -55,8 +54,8 @@ def _copy(state: TrainState) -> TrainState:
     return jax.tree.map(jnp.copy, state)
 
 
-class Health:
-    """Whether a training's numbers are good, from each train step's metrics."""
+class NumericsCheck:
+    """Tells from the metrics of each train step if a training's numbers are good."""
 
     def __init__(self, state: TrainState):
         self._bad_steps = 0
@@ -70,7 +69,7 @@ class Health:
 
     @property
     def finite(self) -> bool:
-        """Whether the learner and the curriculum are: what a state must be to be gone on with."""
+        """True if the learner and the curriculum are finite; only such states are saved."""
         return self._finite
 
     def before(self, state: TrainState) -> None:
@@ -84,50 +83,16 @@ class Health:
         learnt = metrics["ppo/skipped"] < ALL_SKIPPED
         self._bad_steps = 0 if self._finite and learnt else self._bad_steps + 1
 
-    def check(self) -> None:
-        """WentBad where going on has no point."""
+    def require_good(self) -> None:
+        """NonFiniteState where going on has no point."""
         if not self._finite:
-            raise WentBad("the learner or the curriculum is not finite", self._before)
+            raise NonFiniteState("the learner or the curriculum is not finite", self._before)
         if self._bad_steps == PATIENCE:
-            raise WentBad(f"not one finite gradient in {PATIENCE} train steps", self._before)
+            raise NonFiniteState(f"not one finite gradient in {PATIENCE} train steps", self._before)
 
 
-def persist(
-    config: Config,
-    run_dir: Path,
-    go: Callable[[TrainState], TrainState],
-    state: TrainState,
-    again: Callable[[], TrainState],
-    warn: Callable[[str], None],
-) -> TrainState:
-    """`go(state)`; where numbers go bad, once more, with caution, from the state of `again()`.
-
-    Raises:
-      NumbersError: it did not help; the message says what is left to look at.
-    """
-    attempt, back_to = 0, -1
-    while True:
-        try:
-            return go(state)
-        except WentBad as bad:
-            state = again()
-            attempt = attempt + 1 if int(state.step) == back_to else 1
-            back_to = int(state.step)
-            if attempt > ATTEMPTS:
-                left = _leave(config, run_dir / DUMP, bad.before)
-                raise NumbersError(
-                    f"{bad}, also after {ATTEMPTS} attempts from train step {back_to} with lower "
-                    f"learning rates; {left}"
-                ) from bad
-            state = cautious(state, attempt)
-            warn(
-                f"{bad}; back to train step {back_to} with learning rate "
-                f"{float(state.learner.learning_rate):.2g} (attempt {attempt} of {ATTEMPTS})"
-            )
-
-
-def _leave(config: Config, path: Path, state: TrainState) -> str:
-    """Writes the dump; says what to do with it."""
+def leave(config: Config, path: Path, state: TrainState) -> str:
+    """Writes a state with `dump`; returns what to do with it, or why it was not written."""
     try:
         dump(path, config, state)
     except OSError as error:
@@ -135,7 +100,7 @@ def _leave(config: Config, path: Path, state: TrainState) -> str:
     return f"see where: python -m kslc_jax.doctor replay {shlex.quote(str(path))}"
 
 
-def cautious(state: TrainState, attempt: int) -> TrainState:
+def with_lower_rate(state: TrainState, attempt: int) -> TrainState:
     """`state` with a lower learning rate, which may not rise at once, and, so that not all comes
     again, other random draws."""
     rate = state.learner.learning_rate * CAUTION**attempt

@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import env, maths, physics, signals, trials
-from kslc_jax.checkpoint import Policy
+from kslc_jax import env, maths, physics, signals
 from kslc_jax.config import Config, PhysicsConfig
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.evaluation import trials
 from kslc_jax.networks import Params
+from kslc_jax.policy import Policy
 
 FALLEN_SECONDS = 1.0
 """How long a fallen robot lies there before it starts anew."""
@@ -60,7 +61,7 @@ def _advance(
     """One control step; the view of a step that ended in a fall is the last one before it."""
     qvel = memory.env.physics.qvel.at[:2].add(push)
     pushed = memory.env.replace(physics=memory.env.physics.replace(qvel=qvel))
-    before = trials.hold(config, pushed, command, memory.heading)
+    before = trials.with_command(config, pushed, command, memory.heading)
     action = Policy(config, params, curriculum, 0).act_on(before.history)
     after, outcome = env.step(config, before, action, jax.random.fold_in(key, count), curriculum)
     fallen = outcome.terminated

@@ -1,0 +1,55 @@
+"""Rows of numbers as tables for people. Imports no JAX."""
+
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+
+Row = dict[str, float]
+"""Metrics of one commanded speed, by name; `command` is that speed [m/s]."""
+
+Columns = tuple[tuple[str, str, str], ...]
+"""(metric, heading, format) of each column."""
+
+HEADLINE: Columns = (
+    ("survival", "survived", "{:.0%}"),
+    ("forward_mean", "mean vx [m/s]", "{:.2f}"),
+    ("forward_mean_ci", "+-", "{:.2f}"),
+    ("forward_std", "vx std", "{:.2f}"),
+    ("lateral_std", "vy std", "{:.2f}"),
+    ("yaw_rate_std", "yaw std", "{:.2f}"),
+    ("stride_frequency", "strides/s", "{:.2f}"),
+    ("flight_share", "flight", "{:.0%}"),
+    ("clearance", "clearance [m]", "{:.3f}"),
+    ("shoulder_hip_correlation", "arm-leg corr", "{:.2f}"),
+    ("stance_difference", "L-R stance", "{:.0%}"),
+    ("within_speed_limits", "in speed limits", "{:.1%}"),
+    ("cost_of_transport", "CoT", "{:.2f}"),
+    ("momentum_yaw_rms", "Lz rms", "{:.2f}"),
+)
+
+SIDEWAYS_COLUMNS: Columns = (
+    *HEADLINE[:3],
+    ("lateral_mean", "mean vy [m/s]", "{:.2f}"),
+    ("yaw_rate_mean", "mean yaw rate [rad/s]", "{:.2f}"),
+    *HEADLINE[3:],
+)
+"""The same for commands with a side step or a turn, whose means follow the mean forward speed."""
+
+
+def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
+    """The numbers of those columns, one line per commanded speed."""
+    out = Table(title=title, title_justify="left")
+    out.add_column("command [m/s]", justify="right")
+    for _, label, _ in columns:
+        out.add_column(label, justify="right")
+    for row in rows:
+        cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
+        out.add_row(f"{row['command']:.1f}", *cells)
+    return out
+
+
+def console() -> Console:
+    """A console as wide as the terminal, or where there is none as wide as the table."""
+    return Console(highlight=False, width=None if sys.stdout.isatty() else 180)

@@ -1,0 +1,127 @@
+"""A trained policy: to act with, to load, to save. Knows no training."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import flax.struct
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+
+from kslc_jax import config as config_lib
+from kslc_jax import curriculum as curriculum_lib
+from kslc_jax import files, networks, observations
+from kslc_jax.checkpoint_format import (
+    CheckpointError,
+    abstract,
+    checked_metadata,
+    checksum,
+    clear_away,
+    metadata,
+    require_checksum,
+    whole_checkpoints,
+)
+from kslc_jax.config import Config
+from kslc_jax.curriculum import Curriculum
+from kslc_jax.runtime import first_line
+
+POLICIES = Path(__file__).parent / "policies"
+"""Folder of the policies that are shipped with the package."""
+
+
+@flax.struct.dataclass
+class PolicyState:
+    """Memory of a running policy."""
+
+    history: jax.Array  # [K, 59]
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A trained actor. `act` is pure and may be jitted and vmapped."""
+
+    config: Config
+    params: networks.Params
+    curriculum: Curriculum  # where the training had got to: v_max and gait cycle
+    step: int
+
+    def init(self) -> PolicyState:
+        """Memory before the first frame."""
+        return PolicyState(jnp.zeros((self.config.env.frames, observations.ACTOR_WIDTH)))
+
+    def act(self, state: PolicyState, frame: jax.Array) -> tuple[PolicyState, jax.Array]:
+        """Deterministic action [16] for the newest actor frame [59]."""
+        history = observations.append_frame(state.history, frame)
+        return PolicyState(history), self.act_on(history)
+
+    def act_on(self, history: jax.Array) -> jax.Array:
+        """Deterministic action [16] for a whole history [K, 59]."""
+        return networks.policy(self.config, self.params, history).mean
+
+
+def load_policy(path_or_name: str | Path) -> Policy:
+    """Loads a policy from a run folder, a checkpoint folder, or by the name of a shipped one.
+
+    Raises:
+      CheckpointError: nothing there, or it cannot be read.
+    """
+    folder = checkpoint_folder(Path(path_or_name))
+    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
+        try:
+            meta = reader.restore(folder, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
+            meta = checked_metadata(meta["meta"], whole=False)
+            config = config_lib.from_dict(meta["config"])
+            reached = meta["metrics"]
+            step = int(reached.get("step", folder.name if folder.name.isdigit() else 0))
+            curriculum = curriculum_lib.init(config).replace(
+                v_max=jnp.asarray(reached["curriculum/v_max"]),
+                cycle_time=jnp.asarray(reached["curriculum/cycle_time"]),
+            )
+            like = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
+            args = ocp.args.Composite(params=ocp.args.StandardRestore(abstract(like)))
+            params = reader.restore(folder, args=args)["params"]
+            require_checksum(meta.get("checksums", {}), "params", checksum(params))
+        except Exception as error:  # damaged metadata can lead orbax anywhere
+            raise CheckpointError(
+                f"{folder} is no readable checkpoint: {first_line(error)}"
+            ) from error
+    finite = all(np.isfinite(x).all() for x in jax.tree.leaves(params))
+    if not finite:
+        raise CheckpointError(f"{folder}: the parameters hold NaN or infinity")
+    return Policy(config, params, curriculum, step)
+
+
+def save_policy(policy: Policy, folder: Path) -> None:
+    """Writes what `load_policy` reads and nothing else; CheckpointError if it cannot."""
+    reached = policy.curriculum
+    metrics = {
+        "step": policy.step,
+        "curriculum/v_max": float(reached.v_max),
+        "curriculum/cycle_time": float(reached.cycle_time),
+    }
+    meta = metadata(policy.config, metrics, {"params": policy.params})
+    items = {"params": ocp.args.StandardSave(policy.params), "meta": ocp.args.JsonSave(meta)}
+    with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
+        try:
+            writer.save(folder.resolve(), args=ocp.args.Composite(**items))
+        except (OSError, ValueError) as error:
+            clear_away(folder.parent)
+            raise CheckpointError(f"cannot write {folder}: {first_line(error)}") from error
+
+
+def checkpoint_folder(path: Path) -> Path:
+    """The folder of one checkpoint for a run folder, a checkpoint folder or a shipped name."""
+    if not path.exists() and (POLICIES / path).is_dir():
+        path = POLICIES / path
+    if not path.is_dir():
+        shipped = sorted(p.name for p in POLICIES.glob("*") if p.is_dir())
+        names = f" (shipped: {', '.join(shipped)})" if shipped else ""
+        raise CheckpointError(f"no run, checkpoint or shipped policy called '{path}'{names}")
+    if (path / "params").is_dir():
+        return path.resolve()
+    root = path / files.CHECKPOINTS if (path / files.CHECKPOINTS).is_dir() else path
+    steps = whole_checkpoints(root)
+    if not steps:
+        raise CheckpointError(f"no checkpoint in {root}")
+    return max(steps, key=lambda p: int(p.name)).resolve()

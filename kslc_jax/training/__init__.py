@@ -1,0 +1,1 @@
+"""The host side of a training: the loop, checkpoints, the run folder, devices, recovery."""

@@ -1,0 +1,117 @@
+"""The memory that a training takes on each device: estimated before it compiles, measured after.
+
+A train step has two phases, of which the larger one counts. The rollout fills the trajectory and
+needs what one control step needs. The update keeps frames and samples, and adds a minibatch: its
+windows of frames, and what its networks keep for the gradient. Sizes of arrays come from the shapes
+of the program itself; the constants below are read off XLA's buffer assignments;
+docs/performance.md compares.
+"""
+
+import functools
+import os
+from typing import Any
+
+import jax
+
+from kslc_jax import physics, rollout, train_step
+from kslc_jax.config import Config, ConfigError
+from kslc_jax.ppo import Samples
+from kslc_jax.rollout import Trajectory
+from kslc_jax.train_step import TrainState
+
+NUMBER = 4
+"""Bytes of a number."""
+
+KEPT_PER_UNIT = 3
+"""Numbers that each hidden unit keeps for a sample's gradient: its input, its output, the slope."""
+
+STATES_PER_STEP = 3
+"""Environment states that a control step has at a time: the old, the new, the chosen."""
+
+MJX_STEP = 25 * 2**10
+"""Bytes of one environment in MJX's physics step: its model, data, contacts and solver."""
+
+COPIES_OF_NETWORKS = 3
+"""The gradient, its scaled update, and the new parameters, beside those of the state."""
+
+PROCESS = 2**30
+"""Bytes of a process that trains on the CPU, before its first train step: Python, JAX, compiler."""
+
+
+def estimate(config: Config, devices: int = 1) -> int:
+    """Bytes that the train step takes on each device."""
+    state, trajectory, samples = shapes(config)
+    environments = _bytes(state.env) / devices
+    networks = _bytes(state.learner) + COPIES_OF_NETWORKS * _bytes(state.learner.params)
+    in_rollout = _rollout(config, trajectory, environments, devices)
+    in_update = _update(config, state, trajectory, samples, devices)
+    return round(environments + networks + max(in_rollout, in_update))
+
+
+@functools.lru_cache(maxsize=8)
+def shapes(config: Config) -> tuple[TrainState, Trajectory, Samples]:
+    """Shapes of the state, of a rollout and of its samples. The physics, which takes long to trace
+    and changes no shape, is left out."""
+
+    def one() -> tuple[TrainState, Trajectory, Samples]:
+        state = train_step.init(config, 0)
+        args = state.learner.params, state.env, state.curriculum, state.key
+        _, trajectory = rollout.collect(config, *args, simulate=lambda _, state, *more: state)
+        samples = train_step.samples_of(config, trajectory, trajectory.value[-1])
+        return state, trajectory, samples
+
+    return jax.eval_shape(one)
+
+
+def _rollout(config: Config, trajectory: Trajectory, environments: float, devices: int) -> float:
+    """Bytes of the trajectory and of one control step."""
+    mjx = config.env.num_envs * MJX_STEP if physics.resolve_engine(config.physics) == "mjx" else 0
+    return (_bytes(trajectory) + mjx) / devices + STATES_PER_STEP * environments
+
+
+def _update(
+    config: Config, state: TrainState, trajectory: Trajectory, samples: Samples, devices: int
+) -> float:
+    """Bytes of frames and samples, all of them on each device, and of a device's minibatch."""
+    histories = state.env.history, state.env.privileged_history
+    before = sum(_bytes(history) * (1 - 1 / history.shape[1]) for history in histories)
+    frames = _bytes((trajectory.frame, trajectory.privileged)) + before
+    window = _bytes(histories) / config.env.num_envs
+    inputs = window * (2 if config.network.symmetric else 1)  # and split into even and odd parts
+    kept = NUMBER * KEPT_PER_UNIT * (sum(config.network.actor) + sum(config.network.critic))
+    return frames + _bytes(samples) + config.minibatch_size / devices * (inputs + kept)
+
+
+def _bytes(tree: Any) -> int:
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(tree))
+
+
+def measured(compiled: Any) -> int | None:
+    """Bytes on each device that XLA has planned for a compiled train step; None where unknown."""
+    analysis = getattr(compiled, "memory_analysis", lambda: None)()
+    if analysis is None:
+        return None
+    new = analysis.output_size_in_bytes - analysis.alias_size_in_bytes
+    return analysis.argument_size_in_bytes + new + analysis.temp_size_in_bytes
+
+
+def shown(size: float) -> str:
+    """A number of bytes for people."""
+    number, unit = (size / 2**30, "GiB") if size >= 2**30 else (size / 2**20, "MiB")
+    return f"{number:.{1 if number < 10 else 0}f} {unit}"
+
+
+def check(config: Config, devices: int = 1) -> None:
+    """ConfigError where a training cannot fit into its devices' memory."""
+    device = jax.local_devices()[0]
+    memory = (device.memory_stats() or {}).get("bytes_limit")
+    state, *_ = shapes(config)
+    before = _bytes(state.env) / devices + _bytes(state.learner)  # the loop keeps a copy
+    need = estimate(config, devices) + before
+    if memory is None:
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") - PROCESS
+    if need > memory:
+        raise ConfigError(
+            f"env.num_envs, env.frames, ppo.rollout_steps, ppo.minibatches and network sizes need "
+            f"about {shown(need)}; {device.device_kind} has {shown(memory)}"
+        )

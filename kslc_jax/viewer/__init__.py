@@ -1,0 +1,1 @@
+"""Looking at a policy: the live viewer, gait strips and films. Imports no training."""

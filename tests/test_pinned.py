@@ -1,0 +1,91 @@
+"""The numbers of 20 train steps of the debug preset, held against a file.
+
+Refactoring must not change a number. A change that is meant to change numbers writes the file anew,
+in the same commit:
+
+  python -m tests.test_pinned
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from kslc_jax import config as config_lib
+from kslc_jax import train_step
+
+FILE = Path(__file__).parent / "data" / "pinned_metrics.json"
+
+STEPS = 20
+
+FIRST_STEPS = 2
+"""Train steps after which another machine's rounding has not yet grown: a robot is chaotic."""
+
+RELATIVE, ABSOLUTE = 1e-2, 1e-4
+"""Tolerance of the first steps where the machine or a package is another one than the file's."""
+
+PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+
+
+def machine() -> dict[str, str]:
+    """Everything that the last bit of a number depends on."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    flags = [line.split(":")[1].strip() for line in lines if line.startswith("flags")]
+    return {
+        "cpu": names[0] if names else platform.processor(),
+        "avx512": str("avx512f" in flags[0].split() if flags else "unknown"),
+        **{name: importlib.metadata.version(name) for name in PACKAGES},
+    }
+
+
+def metrics(engine: str, steps: int = STEPS) -> dict[str, list[str]]:
+    """Each metric of the first train steps, as hexadecimal floats: no bit is lost in the file."""
+    config = config_lib.preset("debug")
+    physics = dataclasses.replace(config.physics, engine=engine)
+    init, step = train_step.make(dataclasses.replace(config, physics=physics))
+    state, rows = init(), []
+    for _ in range(steps):
+        state, out = step(state)
+        rows.append({name: float(value).hex() for name, value in jax.device_get(out).items()})
+    return {name: [row[name] for row in rows] for name in rows[0]}
+
+
+def check(engine: str) -> None:
+    """Fails where a metric is not the stored one."""
+    stored = json.loads(FILE.read_text())
+    exact = stored["machine"] == machine()
+    steps = STEPS if exact else FIRST_STEPS
+    found, wanted = metrics(engine, steps), stored[engine]
+    assert found.keys() == wanted.keys()
+    for name, values in found.items():
+        if exact:
+            assert values == wanted[name], name
+        else:
+            numbers = [[float.fromhex(x) for x in row[:steps]] for row in (values, wanted[name])]
+            np.testing.assert_allclose(*numbers, rtol=RELATIVE, atol=ABSOLUTE, err_msg=name)
+
+
+def test_numbers_in_c_mujoco_are_pinned():
+    check("mujoco")
+
+
+@pytest.mark.slow  # MJX takes a minute to compile where nothing is cached
+def test_numbers_in_mjx_are_pinned():
+    check("mjx")
+
+
+def main() -> None:
+    """Writes the file anew."""
+    pinned = {"machine": machine(), **{engine: metrics(engine) for engine in ("mujoco", "mjx")}}
+    FILE.write_text(json.dumps(pinned, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

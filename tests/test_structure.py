@@ -1,0 +1,102 @@
+"""The structure of the package: imports point one way, and judging a policy needs no training."""
+
+import ast
+import importlib.util
+import json
+import subprocess
+import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import kslc_jax
+
+ROOT = Path(kslc_jax.__file__).parent
+
+
+def _name(path: Path) -> str:
+    parts = path.relative_to(ROOT.parent).with_suffix("").parts
+    return ".".join(parts).removesuffix(".__init__")
+
+
+MODULES = {_name(path): path for path in sorted(ROOT.rglob("*.py"))}
+
+WINGS = ("kslc_jax.evaluation", "kslc_jax.viewer")
+COMMANDS = tuple(f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "play", "export"))
+NO_TRAINING = [n for n in MODULES if n.startswith(WINGS) or n in ("kslc_jax.policy", *COMMANDS)]
+
+OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "viser"}
+OPTIONAL |= {"kslc_jax.viewer.panel": "viser"}
+"""Modules whose package may not be installed."""
+
+LIGHT = ("config", "robots", "errors", "files", "cli", "train", "evaluate", "sim2sim", "play")
+LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "evaluation.tables")
+"""Modules that are there before JAX is: a config can be checked, and `--help` is quick."""
+
+
+def imported(tree: ast.AST, package: str) -> set[str]:
+    """Modules of this package that a module imports, anywhere in its text, also for types only."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative imports hide where they point"
+            module = node.module or ""
+            names = {f"{module}.{alias.name}" for alias in node.names}
+            submodules = names & MODULES.keys()
+            # `from package import module` needs the package's own file only for other names.
+            found |= submodules or {module}
+    return {name for name in found if name in MODULES and name != package}
+
+
+GRAPH = {name: imported(ast.parse(path.read_text()), name) for name, path in MODULES.items()}
+
+
+def test_imports_have_no_circle():
+    assert "kslc_jax.env" in GRAPH["kslc_jax.rollout"]
+    TopologicalSorter(GRAPH).prepare()  # CycleError names the circle
+
+
+def reached(name: str) -> set[str]:
+    """All modules of this package that a module imports, at once or later."""
+    found, todo = set(), [name]
+    while todo:
+        new = GRAPH[todo.pop()] - found
+        found |= new
+        todo += new
+    return found
+
+
+@pytest.mark.parametrize("name", NO_TRAINING)
+def test_judging_and_looking_import_no_training(name):
+    """Not even inside a function."""
+    assert not [other for other in reached(name) if other.startswith("kslc_jax.training")]
+
+
+def loaded_by(*modules: str) -> dict[str, set[str]]:
+    """The modules that a fresh process has after each of these imports, one after the other."""
+    code = "import importlib, json, sys\nfor name in sys.argv[1:]:\n"
+    code += "    importlib.import_module(name)\n    print(json.dumps([name, [*sys.modules]]))"
+    done = subprocess.run(
+        [sys.executable, "-c", code, *modules],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    return {name: set(loaded) for name, loaded in lines}
+
+
+def test_no_training_is_loaded_with_judging_and_looking():
+    there = [n for n in NO_TRAINING if importlib.util.find_spec(OPTIONAL.get(n, "sys"))]
+    for name, loaded in loaded_by(*there).items():
+        assert not [m for m in loaded if m.startswith("kslc_jax.training")], name
+
+
+def test_configs_and_commands_load_no_jax():
+    for name, loaded in loaded_by(*(f"kslc_jax.{name}" for name in LIGHT)).items():
+        assert not {"jax", "mujoco", "orbax"} & loaded, name
