@@ -18,8 +18,8 @@ class Curriculum:
     fast_tracking: jax.Array  # [] the same over the commands in the top part of the range
     episode_steps: jax.Array  # [] moving average length of finished episodes
     gait: jax.Array  # [] moving average of how well feet follow the clock at speed, -0.3 to 1
-    top_speed: jax.Array  # [] m/s, fading sum of vx over the settled commands at the top
-    top_commanded: jax.Array  # [] m/s, the same of the commanded vx
+    top_deviation: jax.Array  # [] m/s, fading sum of vx - commanded vx, settled commands at the top
+    top_scale: jax.Array  # [] m/s, the same of the commanded vx, or of `top_error_floor` if more
     top_falls: jax.Array  # [] fading sum of the falls under commands at the top
     top_minutes: jax.Array  # [] the same of the time that robots had such commands
     updates: jax.Array  # [] int, updates since the last change
@@ -36,8 +36,8 @@ class Progress:
     episode_steps: jax.Array  # [] mean length of the episodes that ended; see train_step.init
     episode_count: jax.Array  # [] number of those
     gait: jax.Array  # [] mean of the feet_contact_number term over the fast commands' samples
-    top_speed: jax.Array  # [] m/s, sum of vx over the settled commands at the top of the range
-    top_commanded: jax.Array  # [] m/s, sum of their commanded vx
+    top_deviation: jax.Array  # [] m/s, sum of vx - commanded vx, settled commands at the top
+    top_scale: jax.Array  # [] m/s, sum of their commanded vx, or of `top_error_floor` if more
     top_falls: jax.Array  # [] falls under commands at the top
     top_minutes: jax.Array  # [] minutes that robots had such commands, all robots together
 
@@ -51,8 +51,8 @@ def init(config: Config) -> Curriculum:
         fast_tracking=jnp.zeros(()),
         episode_steps=jnp.zeros(()),
         gait=jnp.zeros(()),
-        top_speed=jnp.zeros(()),
-        top_commanded=jnp.zeros(()),
+        top_deviation=jnp.zeros(()),
+        top_scale=jnp.zeros(()),
         top_falls=jnp.zeros(()),
         top_minutes=jnp.zeros(()),
         updates=jnp.zeros((), jnp.int32),
@@ -80,9 +80,9 @@ def is_top(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.Ar
 
 def top_error(state: Curriculum) -> jax.Array:
     """Relative error [] of the mean speed under commands at the top of the range; 1 before any."""
-    known = state.top_commanded > 0.0
-    commanded = jnp.where(known, state.top_commanded, 1.0)
-    return jnp.where(known, jnp.abs(state.top_speed / commanded - 1.0), 1.0)
+    known = state.top_scale > 0.0
+    error = jnp.abs(state.top_deviation) / jnp.where(known, state.top_scale, 1.0)
+    return jnp.where(known, error, 1.0)
 
 
 def top_falls(state: Curriculum) -> jax.Array:
@@ -125,8 +125,8 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
         cycle_time=cycle,
         fast_tracking=zero,
         gait=zero,
-        top_speed=zero,
-        top_commanded=zero,
+        top_deviation=zero,
+        top_scale=zero,
         top_falls=zero,
         top_minutes=zero,
         updates=jnp.zeros((), jnp.int32),
@@ -147,8 +147,8 @@ def _averaged(config: CurriculumConfig, state: Curriculum, progress: Progress) -
         fast_tracking=average(state.fast_tracking, progress.fast_tracking, fast_count),
         episode_steps=average(state.episode_steps, progress.episode_steps, progress.episode_count),
         gait=average(state.gait, progress.gait, fast_count),
-        top_speed=config.smoothing * state.top_speed + progress.top_speed,
-        top_commanded=config.smoothing * state.top_commanded + progress.top_commanded,
+        top_deviation=config.smoothing * state.top_deviation + progress.top_deviation,
+        top_scale=config.smoothing * state.top_scale + progress.top_scale,
         top_falls=config.smoothing * state.top_falls + progress.top_falls,
         top_minutes=config.smoothing * state.top_minutes + progress.top_minutes,
         updates=state.updates + 1,

@@ -182,6 +182,7 @@ def _progress(config: Config, out: Outcome) -> Progress:
     episode_steps, episode_count = mean_over(out.episode_steps, done)
     gait, _ = mean_over(out.terms["feet_contact_number"], out.fast)
     top = out.top & ~out.broken
+    settled_top, floor = top & out.settled, config.curriculum.top_error_floor
     return Progress(
         tracking=tracking,
         tracking_count=tracking_count,
@@ -190,8 +191,8 @@ def _progress(config: Config, out: Outcome) -> Progress:
         episode_steps=episode_steps,
         episode_count=episode_count,
         gait=gait,
-        top_speed=jnp.sum(out.speed * (top & out.settled)),
-        top_commanded=jnp.sum(out.commanded * (top & out.settled)),
+        top_deviation=jnp.sum((out.speed - out.commanded) * settled_top),
+        top_scale=jnp.sum(jnp.maximum(out.commanded, floor) * settled_top),
         top_falls=jnp.sum(out.terminated & top),
         top_minutes=jnp.sum(top) * (config.control_dt / 60.0),
     )

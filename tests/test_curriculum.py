@@ -30,13 +30,13 @@ def progress(
     count=5,
     settled=100,
     gait=0.7,
-    top_speed=40.0,
-    top_commanded=40.0,
+    top_deviation=0.0,
+    top_scale=40.0,
     top_falls=0.0,
     top_minutes=1.0,
 ) -> Progress:
     values = (tracking, settled, fast, fast_count, steps, count, gait)
-    top = (top_speed, top_commanded, top_falls, top_minutes)
+    top = (top_deviation, top_scale, top_falls, top_minutes)
     return Progress(*(jnp.asarray(v, jnp.float32) for v in (*values, *top)))
 
 
@@ -96,13 +96,13 @@ STRICT = dataclasses.replace(DIRECT, top_error=0.05, top_falls=1.0)
 @pytest.mark.parametrize(
     ("seen", "opens"),
     [
-        ({"top_speed": 38.1}, True),
-        ({"top_speed": 37.9}, False),  # 5.25 % too slow
-        ({"top_speed": 42.1}, False),  # 5.25 % too fast
+        ({"top_deviation": -1.9}, True),
+        ({"top_deviation": -2.1}, False),  # 5.25 % too slow
+        ({"top_deviation": 2.1}, False),  # 5.25 % too fast
         ({"top_falls": 1.0}, True),
         ({"top_falls": 1.1}, False),
         ({"top_falls": 1.1, "top_minutes": 2.0}, True),
-        ({"top_commanded": 0.0}, False),  # nobody was asked to run that fast yet
+        ({"top_scale": 0.0}, False),  # nobody was asked to run that fast yet
     ],
     ids=str,
 )
@@ -113,15 +113,15 @@ def test_a_range_whose_top_is_not_run_does_not_grow(seen, opens):
 
 
 def test_the_tops_sums_fade_by_hand():
-    """Speeds 1.9 of 2.0, then 2.4 of 2.0: (0.95 * 19 + 24) / (0.95 * 20 + 20) - 1 = 0.07821; falls
-    (0.95 * 2 + 0) / (0.95 * 1 + 1) = 0.97436 a minute. A wider range starts anew."""
-    one = curriculum.update(CONFIG, state(), progress(top_speed=19, top_commanded=20, top_falls=2))
-    two = curriculum.update(CONFIG, one, progress(top_speed=24, top_commanded=20))
+    """1 m/s too slow, then 4 too fast, of 20 each: (0.95 * -1 + 4) / (0.95 * 20 + 20) = 0.07821;
+    falls (0.95 * 2 + 0) / (0.95 * 1 + 1) = 0.97436 a minute. A wider range starts anew."""
+    one = curriculum.update(CONFIG, state(), progress(top_deviation=-1, top_scale=20, top_falls=2))
+    two = curriculum.update(CONFIG, one, progress(top_deviation=4, top_scale=20))
     assert float(curriculum.top_error(two)) == pytest.approx(0.07821, abs=1e-5)
     assert float(curriculum.top_falls(two)) == pytest.approx(0.97436, abs=1e-5)
     assert float(curriculum.top_error(state())) == 1.0 and float(curriculum.top_falls(state())) == 0
     wider = curriculum.update(DIRECT, state(**READY), progress(top_falls=3.0))
-    assert float(wider.top_speed) == float(wider.top_commanded) == 0.0
+    assert float(wider.top_deviation) == float(wider.top_scale) == 0.0
     assert float(wider.top_falls) == float(wider.top_minutes) == 0.0
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint_format, networks, rollout, train_step
+from kslc_jax import checkpoint_format, env, networks, rollout, train_step
 from kslc_jax.config import preset
 
 
@@ -200,3 +200,28 @@ def test_robots_start_unlike_each_other(made):
     env = made[1]().env
     assert len(np.unique(env.dynamics.friction)) == len(np.unique(env.time)) == 16
     assert len(np.unique(env.command.heading)) > 8
+
+
+def test_slow_commands_at_the_top_count_as_if_they_were_faster():
+    """Commands of 0.5 and 3.0 m/s, run at 0.4 and 3.3: off by -0.1 + 0.3, measured against 2.0 and
+    3.0. The third command has not settled, the fourth is not at the top."""
+    no = jnp.zeros(4, bool)
+    out = env.Outcome(
+        reward=jnp.zeros(4),
+        terminated=jnp.array([False, True, True, True]),
+        truncated=no,
+        broken=no,
+        terms={"tracking_lin_vel": jnp.zeros(4), "feet_contact_number": jnp.zeros(4)},
+        settled=jnp.array([True, True, False, True]),
+        fast=no,
+        top=jnp.array([True, True, True, False]),
+        commanded=jnp.array([0.5, 3.0, 3.0, 1.0]),
+        speed=jnp.array([0.4, 3.3, 0.0, 0.0]),
+        episode_steps=jnp.zeros(4, int),
+        speeding=no,
+    )
+    progress = train_step._progress(preset("laptop"), out)
+    assert float(progress.top_deviation) == pytest.approx(0.2)
+    assert float(progress.top_scale) == pytest.approx(5.0)
+    assert float(progress.top_falls) == 2.0
+    assert float(progress.top_minutes) == pytest.approx(3 * 0.01 / 60)

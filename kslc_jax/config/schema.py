@@ -413,6 +413,9 @@ class CurriculumConfig:
     top_error: float = 1e9
     """Relative error of the mean speed that commands in the top `v_step` of the range may have, for
     the range to grow: what cannot be run is not widened. 1e9: any."""
+    top_error_floor: float = 2.0
+    """Commands below this speed [m/s] count as if they were this fast: slow walks need not be as
+    exact before there are faster ones."""
     top_falls: float = 1e9
     """Falls per minute that those commands may lead to. 1e9: any."""
     settle_seconds: float = 0.0
@@ -433,6 +436,7 @@ class CurriculumConfig:
         )
         require(0 <= self.smoothing < 1, "curriculum.smoothing must lie in [0, 1)")
         require(self.top_error > 0, "curriculum.top_error must be positive")
+        require(self.top_error_floor > 0, "curriculum.top_error_floor must be positive")
         require(self.top_falls >= 0, "curriculum.top_falls must not be negative")
 
 
