@@ -177,8 +177,9 @@ def write_animation(path: Path, pictures: Iterable, seconds: float) -> None:
     from PIL import Image
 
     first, *others = map(Image.fromarray, pictures)
-    settings = {"duration": round(1000 * seconds), "loop": 0, "quality": QUALITY}
-    first.save(path, save_all=True, append_images=others, **settings)
+    milliseconds = round(1000 * seconds)
+    more = {"append_images": others, "duration": milliseconds, "loop": 0, "quality": QUALITY}
+    first.save(path, None, save_all=True, **more)
 
 
 def draw(args: Args, policy) -> None:
