@@ -38,13 +38,15 @@ lint: $(STAMP) ## ruff and ty
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ty check
 
-# The commands stand in docs/results.md, each beside what it makes.
-figures: $(STAMP) ## The figures of docs/results.md again, from the data beside them: a minute
-	@grep '^python -m kslc_jax.plots' docs/results.md | PATH="$(BIN):$$PATH" sh -ex
+# The commands stand in these pages, each beside what it makes.
+RESULTS := docs/results.md docs/lab_notebook.md
 
-results: $(STAMP) ## Those data too, from the shipped policy, and its gait strips: half an hour
+figures: $(STAMP) ## The figures of docs/results.md again, from the data beside them: a minute
+	@grep -h '^python -m kslc_jax.plots' $(RESULTS) | PATH="$(BIN):$$PATH" sh -ex
+
+results: $(STAMP) ## Those data too, from the shipped policy, its gait strips and its film: half an hour
 	@$(PIP) -e '.[drake]'
-	@grep -E '^python -m kslc_jax.(evaluate|sim2sim|play|plots)' docs/results.md | PATH="$(BIN):$$PATH" sh -ex
+	@grep -hE '^python -m kslc_jax.(evaluate|sim2sim|play|plots)' $(RESULTS) | PATH="$(BIN):$$PATH" sh -ex
 
 bench: $(STAMP) ## Throughput of a whole training step
 	@$(BIN)/python -m benchmarks.throughput --repeats 3 $(ARGS)

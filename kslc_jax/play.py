@@ -12,7 +12,7 @@ import ipaddress
 import math
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,11 @@ FPS = 50
 
 STRIPS = (".png", ".jpg")
 FILMS = (".mp4", ".mkv", ".mov")
+ANIMATIONS = (".webp", ".gif")
+"""Films that web pages show like pictures. They need no ffmpeg and have half the frames."""
+
+QUALITY = 60
+"""Quality of an animation, 0 to 100: six seconds take about 1 MB."""
 
 SPEED_SECONDS = 0.5
 """Span over which the speed written into the video is taken."""
@@ -54,7 +59,8 @@ class Args:
     gait_strip: Path | None = None
     """PNG to write: one strip per speed."""
     video: Path | None = None
-    """MP4 to write; needs the package imageio-ffmpeg (pip install 'kslc_jax[video]')."""
+    """Film to write, one speed after the other. MP4, MKV and MOV need the package imageio-ffmpeg
+    (pip install 'kslc_jax[video]'); WEBP and GIF need nothing more."""
 
     def __post_init__(self):
         if not 0 < self.seconds < math.inf:
@@ -62,7 +68,7 @@ class Args:
         if not (self.speeds and all(map(math.isfinite, self.speeds))):
             raise ConfigError("speeds: name at least one, finite")
         require_seed(self.seed)
-        for path, kinds in ((self.gait_strip, STRIPS), (self.video, FILMS)):
+        for path, kinds in ((self.gait_strip, STRIPS), (self.video, FILMS + ANIMATIONS)):
             if path is not None and path.suffix.lower() not in kinds:
                 raise ConfigError(f"{path}: its name must end in {' or '.join(kinds)}")
         if self.engine != "mujoco" and self.fidelity != "high":
@@ -138,23 +144,43 @@ def film_writer():
     return imageio
 
 
-def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
-    """Films the speeds one after the other at real time, commanded and actual speed written in."""
+def film(args: Args, trace, spans: Sequence[range], every: int, dt: float) -> Iterator:
+    """Pictures [H, W, 3] of every `every`-th step of the spans, one speed after the other, with the
+    commanded and the actual speed written into them."""
     from kslc_jax.viewer import render
 
-    imageio = film_writer()
+    window = round(SPEED_SECONDS / dt)
+    for i, (command, steps) in enumerate(zip(args.speeds, spans, strict=True)):
+        filmed = steps[::every]
+        for step, picture in zip(filmed, render.frames(trace.qpos[filmed, i]), strict=True):
+            speed = trace.linvel[max(0, step + 1 - window) : step + 1, i, 0].mean()
+            text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
+            yield caption(picture, text)
 
+
+def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
+    """Writes the film at real time; the suffix of `path` decides the format."""
+    if path.suffix.lower() in ANIMATIONS:
+        every = max(1, round(2.0 / (FPS * dt)))
+        write_animation(path, film(args, trace, spans, every, dt), every * dt)
+        return
+    imageio = film_writer()
     # ffmpeg is started in a process of its own at once: nothing of JAX runs in the fork.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
     every = max(1, round(1.0 / (FPS * dt)))
-    span = round(SPEED_SECONDS / dt)
-    with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as film:
-        for i, (command, steps) in enumerate(zip(args.speeds, spans, strict=True)):
-            filmed = steps[::every]
-            for step, picture in zip(filmed, render.frames(trace.qpos[filmed, i]), strict=True):
-                speed = trace.linvel[max(0, step + 1 - span) : step + 1, i, 0].mean()
-                text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
-                film.append_data(caption(picture, text))
+    with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as out:
+        for picture in film(args, trace, spans, every, dt):
+            out.append_data(picture)
+
+
+def write_animation(path: Path, pictures: Iterable, seconds: float) -> None:
+    """Writes an animated WebP or GIF that repeats for ever; each picture lasts `seconds`."""
+    from PIL import Image
+
+    first, *others = map(Image.fromarray, pictures)
+    milliseconds = round(1000 * seconds)
+    more = {"append_images": others, "duration": milliseconds, "loop": 0, "quality": QUALITY}
+    first.save(path, None, save_all=True, **more)
 
 
 def draw(args: Args, policy) -> None:
@@ -165,7 +191,7 @@ def draw(args: Args, policy) -> None:
 
     for path in (args.gait_strip, args.video):
         files.require_writable(path)
-    if args.video is not None:
+    if args.video is not None and args.video.suffix.lower() in FILMS:
         film_writer()
     trace, start, dt = record(args, policy)
     for speed, up in zip(args.speeds, trace.alive[-1], strict=True):

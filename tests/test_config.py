@@ -191,7 +191,7 @@ LEARNER = {
 
 
 def test_laptop_departs_from_the_paper_in_these_numbers_only():
-    """docs/fidelity.md, "The laptop preset", gives the reason of each."""
+    """docs/laptop_recipe.md gives the reason of each."""
     assert {k: v[1] for k, v in changes(PAPER, LAPTOP).items()} == LEARNER | {
         "network.estimator": (128, 64),
         "ppo.entropy_fades": True,

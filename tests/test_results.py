@@ -1,4 +1,4 @@
-"""The tables of docs/results.md say what the data beside them say."""
+"""The tables of docs/results.md and docs/lab_notebook.md say what the stored data say."""
 
 import itertools
 import json
@@ -11,6 +11,7 @@ from kslc_jax.evaluation import tables
 from kslc_jax.policy import POLICIES
 
 DOCS = Path(__file__).parents[1] / "docs"
+PAGES = ("results.md", "lab_notebook.md")
 
 FORMS = {
     "survived": ("survival", "{:.0%}"),
@@ -28,8 +29,12 @@ FORMS = {
 
 
 def table(section: str) -> list[list[str]]:
-    """Cells of a section's first table, its header first."""
-    text = (DOCS / "results.md").read_text().split(f"\n## {section}\n")[1]
+    """Cells of a section's first table, its header first; the section is in one of the pages."""
+    (text,) = (
+        part.partition("\n## ")[0]
+        for page in PAGES
+        for part in (DOCS / page).read_text().split(f"\n## {section}\n")[1:]
+    )
     lines = itertools.dropwhile(lambda line: not line.startswith("|"), text.splitlines())
     head, _, *rows = itertools.takewhile(lambda line: line.startswith("|"), lines)
     return [[cell.strip() for cell in row.strip("|").split("|")] for row in (head, *rows)]

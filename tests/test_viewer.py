@@ -308,27 +308,51 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
     assert camera.fovy == before != render.LONG_LENS
 
 
-def test_video_carries_the_speeds(monkeypatch, tmp_path):
-    """Two speeds of half a second each at 50 frames a second, with text, drawn without GL."""
-    imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
-    pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
+@pytest.fixture
+def blank_renderer(monkeypatch):
+    """Draws black pictures, without GL."""
     blank = SimpleNamespace(frames=lambda qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos))
     monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
     monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
-    said = []
-    write = play.caption
-    monkeypatch.setattr(play, "caption", lambda p, text: said.append(text) or write(p, text))
+
+
+def film_two_speeds(out: Path) -> None:
+    """Writes half a second at 1 m/s and half a second at 2 m/s."""
     args = play.Args(Path("x"), speeds=(1.0, 2.0), seconds=0.5)
     linvel = np.zeros((150, 2, 3))
     linvel[..., 0] = 0.9, 2.1
     trace = SimpleNamespace(qpos=np.zeros((150, 2, 23)), linvel=linvel)
-    play.write_video(tmp_path / "out.mp4", args, trace, [range(100, 150)] * 2, dt=0.01)
+    play.write_video(out, args, trace, [range(100, 150)] * 2, dt=0.01)
+
+
+def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
+    """Two speeds of half a second each at 50 frames a second, with text."""
+    imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
+    pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
+    said = []
+    write = play.caption
+    monkeypatch.setattr(play, "caption", lambda p, text: said.append(text) or write(p, text))
+    film_two_speeds(tmp_path / "out.mp4")
     frames = imageio.mimread(tmp_path / "out.mp4", memtest=False)
     assert len(frames) == 50 and max(f.max() for f in frames) > 200
     assert set(said) == {
         "commanded 1.0 m/s\nactual 0.90 m/s",
         "commanded 2.0 m/s\nactual 2.10 m/s",
     }
+
+
+@pytest.mark.parametrize("suffix", play.ANIMATIONS)
+def test_animations_last_as_long_and_repeat(suffix, blank_renderer, monkeypatch, tmp_path):
+    """Every fourth of 2 x 50 steps of 10 ms is a picture of 40 ms. Equal pictures may be stored as
+    one that lasts longer, so that only the sum is known. imageio is not needed."""
+    from PIL import Image, ImageSequence
+
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    film_two_speeds(tmp_path / f"out{suffix}")
+    with Image.open(tmp_path / f"out{suffix}") as film:
+        assert film.size == (640, 480) and film.is_animated and film.info["loop"] == 0
+        shown = [(f.load(), f.info["duration"])[1] for f in ImageSequence.Iterator(film)]
+        assert sum(shown) == 2 * 13 * 40 and np.asarray(film.convert("L")).max() > 200
 
 
 @pytest.mark.parametrize(

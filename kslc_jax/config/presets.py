@@ -27,7 +27,7 @@ _BASELINE = _override(
     curriculum={"velocity": False, "cycle": False, "v_start": 3.5},
 )
 
-# Learns fast on two CPU cores. What it changes and why: docs/fidelity.md, "The laptop preset".
+# Learns fast on two CPU cores. What it changes and why: docs/laptop_recipe.md.
 _LAPTOP_LEARNER: dict[str, Any] = {
     "env": {"num_envs": 2048, "frames": 5},
     "network": {

@@ -1,0 +1,87 @@
+"""The documents: links lead somewhere, names exist, every page is listed."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+import kslc_jax
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.glob("*.md"), *(ROOT / "kslc_jax").rglob("*.md")])
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+def prose(path: Path) -> str:
+    """A page's or a notebook's text without its fenced code."""
+    text = path.read_text()
+    if path.suffix == ".ipynb":
+        cells = json.loads(text)["cells"]
+        text = "\n\n".join("".join(c["source"]) for c in cells if c["cell_type"] == "markdown")
+    return re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S)
+
+
+def anchors(path: Path) -> set[str]:
+    """The names that GitHub gives to a page's headings."""
+    headings = re.findall(r"^#+ (.*)$", prose(path), re.M)
+    kept = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
+    return {heading.replace(" ", "-") for heading in kept}
+
+
+def broken_links(path: Path) -> list[str]:
+    """The relative links of a page that lead nowhere."""
+    links = re.findall(r"\]\(([^)\s]+)\)", prose(path))
+    broken = []
+    for link in (link for link in links if not re.match(r"[a-z]+:", link)):
+        name, _, anchor = link.partition("#")
+        target = (path.parent / name).resolve() if name else path
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+    return broken
+
+
+@pytest.mark.parametrize("path", PAGES + NOTEBOOKS, ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    assert broken_links(path) == []
+
+
+def test_a_broken_link_is_found(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# A head-line, *bold*\n[a](#a-head-line-bold) [b](none.md) [c](page.md#no)")
+    assert broken_links(page) == ["none.md", "page.md#no"]
+
+
+def test_every_page_is_listed():
+    listed = set(re.findall(r"^- \[[^\]]*\]\((\w+\.md)\)", (DOCS / "index.md").read_text(), re.M))
+    assert listed == {path.name for path in DOCS.glob("*.md")} - {"index.md"}
+
+
+def test_pages_named_in_code_exist():
+    code = [*ROOT.glob("kslc_jax/**/*.py"), *ROOT.glob("kslc_jax/**/*.xml"), ROOT / "Makefile"]
+    code += [*ROOT.glob("benchmarks/*.py"), *ROOT.glob("examples/*.py"), *ROOT.glob("tests/*.py")]
+    named = {name for path in code for name in re.findall(r"docs/\w+\.md", path.read_text())}
+    assert named and [name for name in sorted(named) if not (ROOT / name).exists()] == []
+
+
+def test_tests_named_in_documents_exist():
+    defined = {path.stem for path in ROOT.glob("tests/*.py")}
+    for path in ROOT.glob("tests/*.py"):
+        defined |= set(re.findall(r"^\s*(?:def|class) (test_\w+|Test\w+)", path.read_text(), re.M))
+    named = {
+        name for path in PAGES for name in re.findall(r"\b(test_\w+|Test[A-Z]\w+)", prose(path))
+    }
+    assert len(named) > 50 and sorted(named - defined) == []
+
+
+def test_the_film_comes_first_and_is_small():
+    readme = (ROOT / "README.md").read_text().splitlines()
+    film = re.fullmatch(r"!\[.+\]\((docs/media/\w+\.webp)\)", readme[2])
+    assert film and (ROOT / film[1]).stat().st_size < 3_000_000
+    assert len(readme) <= 150
+    assert f"--video {film[1]}" in (DOCS / "results.md").read_text()
+
+
+def test_the_citation_has_the_packages_version():
+    assert f"\nversion: {kslc_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
