@@ -20,6 +20,7 @@ from pathlib import Path
 
 import tyro
 
+from kslc_jax import files
 from kslc_jax.config import preset
 
 WALL_CLOCK = ("seconds", "steps_per_second")
@@ -39,13 +40,13 @@ def command(run_dir: Path, *args: object) -> list[str]:
 
 def checkpoints(run_dir: Path) -> list[int]:
     """Train steps of the whole checkpoints, oldest first."""
-    folders = (run_dir / "checkpoints").glob("*")
+    folders = (run_dir / files.CHECKPOINTS).glob("*")
     return sorted(int(p.name) for p in folders if p.name.isdigit())
 
 
 def saving(run_dir: Path) -> bool:
     """Whether a half-written checkpoint is there."""
-    return any((run_dir / "checkpoints").glob("*.orbax-checkpoint-tmp"))
+    return any((run_dir / files.CHECKPOINTS).glob("*.orbax-checkpoint-tmp"))
 
 
 def wait_until(what, process: subprocess.Popen, log: Path, seconds: float = 300.0) -> None:
@@ -87,7 +88,7 @@ def kill(run_dir: Path, number: signal.Signals, moment: str, log: Path, rng: ran
 
 def records(run_dir: Path) -> list[dict[str, float]]:
     """metrics.jsonl without what depends on the wall clock."""
-    rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+    rows = [json.loads(line) for line in (run_dir / files.METRICS).read_text().splitlines()]
     return [{k: v for k, v in row.items() if k not in WALL_CLOCK} for row in rows]
 
 
