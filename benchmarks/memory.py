@@ -1,8 +1,8 @@
 """Memory and speed of whole training over environments and frames; one process for each point.
 
-`peak` is all that the process ever held, on an accelerator what the device did. `estimated` is what
-`kslc_jax.memory` reckons before anything is compiled, `planned` what XLA says once it is; on a CPU
-the process holds its own imports, the compiler and two states besides.
+`peak` is all that the process ever held, on an accelerator what the device did. `estimated` is
+what `training.memory` reckons before anything is compiled, `planned` what XLA says once it is; on a
+CPU the process holds its own imports, the compiler and two states besides.
 
 A point that does not fit, by the estimate or by its death, is told and left out. What is measured
 is drawn, also where the time is up before the end.
