@@ -83,8 +83,8 @@ def test_commands_run_from_an_installed_package(python, tmp_path):
         return run(python, "-m", f"kslc_jax.{name}", *args, cwd=tmp_path)
 
     assert "done: 8 train steps" in command("train", *TRAINED, "r")
-    assert "command [m/s]" in command("evaluate", "r", *SHORT)
-    assert "command [m/s]" in command("sim2sim", "xbot_l_run", *SHORT)
+    assert "r, train step 8, train fidelity" in command("evaluate", "r", *SHORT)
+    assert "xbot_l_run, train step" in command("sim2sim", "xbot_l_run", *SHORT)
     assert "equals JAX" in command("export", "xbot_l_run", "policy.onnx")
     assert "python -m kslc_jax.play" in command("play", "--help")
     assert {path: path.stat().st_mtime_ns for path in installed.rglob("*")} == before
