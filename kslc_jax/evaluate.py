@@ -149,13 +149,15 @@ def table(rows: list[dict[str, float]], title: str, columns=HEADLINE):
     """The numbers of those columns as a rich table."""
     from rich.table import Table
 
-    out = Table(title=title, title_justify="left")
+    marked = any("beyond" in row for row in rows)
+    caption = "* beyond what the policy was trained for" if marked else None
+    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     out.add_column("command [m/s]", justify="right")
     for _, label, _ in columns:
         out.add_column(label, justify="right")
     for row in rows:
         cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
-        out.add_row(f"{row['command']:.1f}", *cells)
+        out.add_row(f"{row['command']:.1f}" + "*" * ("beyond" in row), *cells)
     return out
 
 
