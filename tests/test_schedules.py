@@ -125,7 +125,7 @@ def test_a_file_that_is_no_schedule_is_told_in_one_line(tmp_path, text, says):
 
 
 def test_an_unknown_name_lists_the_known_ones():
-    with pytest.raises(ConfigError, match="no file 'stopp' .*stop, reverse"):
+    with pytest.raises(ConfigError, match=r"no file 'stopp' .*stop, reverse"):
         schedules.named("stopp", CONFIG, 4.0)
 
 
