@@ -68,6 +68,12 @@ def test_random_commands_stay_in_the_trained_box(name, shortest):
     assert len({n[-1] for n in number}) > 3
 
 
+def test_box_draws_every_four_seconds():
+    number, velocity, _ = played(schedules.named("box", CONFIG, 4.0), 60.0, robots=16)
+    np.testing.assert_array_equal(number[:, 200::400], np.tile(np.arange(15), (16, 1)))
+    assert velocity[..., 0].max() < 4.0  # a drawn one is never the top itself
+
+
 def test_turns_ask_for_what_training_asks():
     """Pi of heading error at rest, shrinking to nothing at narrow_speed, times the gain."""
     rates = {s.vx: s.yaw_rate for s in schedules.named("turns", CONFIG, 4.0).steps if s.yaw_rate}

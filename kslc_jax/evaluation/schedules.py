@@ -19,7 +19,7 @@ import numpy as np
 from kslc_jax import commands, maths
 from kslc_jax.config import CommandConfig, Config, ConfigError
 
-NAMES = ("stop", "reverse", "random", "jitter", "turns", "tour")
+NAMES = ("stop", "reverse", "box", "random", "jitter", "turns", "tour")
 """The built-in schedules, see `named`."""
 
 RUN, REST = 5.0, 4.0
@@ -68,6 +68,7 @@ class Schedule:
     low: float = 0.0  # m/s, the slowest one
     steps: tuple[Step, ...] = ()  # the list; empty if the commands are drawn
     seconds: tuple[float, float] = (PATIENCE, PATIENCE)  # shortest and longest drawn leg
+    brakes: bool = False  # some of the drawn legs run at the top speed, then stop or reverse
     tour: bool = False
 
 
@@ -106,10 +107,12 @@ def named(name: str, config: Config, v_max: float, top: float | None = None) -> 
             steps = Step(RUN, fastest), Step(REST, low)
         case "turns":
             steps = _turns(config.command, fastest)
+        case "box":
+            return dataclasses.replace(blank, seconds=(4.0, 4.0))
         case "random":
-            return dataclasses.replace(blank, seconds=(1.0, 4.0))
+            return dataclasses.replace(blank, seconds=(1.0, 4.0), brakes=True)
         case "jitter":
-            return dataclasses.replace(blank, seconds=(0.3, 4.0))
+            return dataclasses.replace(blank, seconds=(0.3, 4.0), brakes=True)
         case "tour":
             return dataclasses.replace(blank, tour=True)
         case _:
@@ -239,10 +242,10 @@ def _drawn(schedule: Schedule, config: CommandConfig, leg: Leg, key, yaw: jax.Ar
     shortest, longest = schedule.seconds
     low, top = jnp.asarray(schedule.low), jnp.asarray(schedule.top)
     place = leg.number % BLOCK
-    fast, brakes = place == BLOCK - 2, place == BLOCK - 1
+    fast, brakes = (schedule.brakes & (place == BLOCK - back) for back in (2, 1))
     sampled = commands.sample(config, keys[0], (low, top), yaw)
-    back = jax.random.bernoulli(keys[1], REVERSALS)
-    straight = jnp.where(fast, top, jnp.where(back, low, 0.0)) * jnp.array([1.0, 0.0, 0.0])
+    reverses = jax.random.bernoulli(keys[1], REVERSALS)
+    straight = jnp.where(fast, top, jnp.where(reverses, low, 0.0)) * jnp.array([1.0, 0.0, 0.0])
     drawn = sampled.velocity.at[2].set(0.0)  # the heading says where to turn
     special = fast | brakes
     seconds = jax.random.uniform(keys[2], minval=shortest, maxval=longest)
