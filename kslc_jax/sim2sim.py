@@ -70,8 +70,8 @@ class Args:
     schedule: tuple[str, ...] = ()
     """Commands that change during a trial, in place of --speeds: stop (top speed 5 s, rest 4 s),
     reverse (top 5 s, backwards 4 s), box (every 4 s a command as training draws them), random
-    (every 1 to 4 s, with stops and reversals from the top), jitter (every 0.3 to 4 s), turns (at three speeds), tour
-    (way-points), or a JSON file."""
+    (every 1 to 4 s, with stops and reversals from the top), jitter (every 0.3 to 4 s), turns (at
+    three speeds), tour (way-points), or a JSON file."""
     top: float | None = None
     """Fastest speed of a schedule [m/s]; None: the fastest that the policy was trained for."""
     heading: tuple[float, ...] = (0.0,)
