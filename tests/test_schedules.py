@@ -212,6 +212,14 @@ def test_a_fall_counts_in_survival_and_is_told():
     assert shown[44] is not None and shown[45:] == [None] * 45
 
 
+@pytest.mark.parametrize(("lived", "changes"), [(150, 0), (350, 0), (750, 1)])
+def test_the_leg_of_a_fall_is_no_change(lived, changes):
+    leg = np.repeat([0, 1, 2], [300, 300, 300])
+    trace = synthetic(1.0 * leg, 1.0 * leg, leg, np.arange(900) < lived)
+    found = reaction.summary(trace, DT)
+    assert found["changes"] == changes and ("settled" in found) == bool(changes)
+
+
 # ----------------------------------------------------------------------------------------- trained
 
 

@@ -5,6 +5,7 @@ cycle. Legs count up to a fall; the leg in which a robot falls counts in surviva
 """
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -130,12 +131,12 @@ def _changes(trace: Trace, robot: int, dt: float) -> list[Change]:
     command = np.asarray(trace.command)[:end, robot, :2]
     position = np.asarray(trace.qpos)[:end, robot, :2]
     starts = np.flatnonzero(np.diff(leg)) + 1
-    ends = [*starts[1:], end]
-    if fell and len(starts):
-        starts, ends = starts[:-1], ends[:-1]
+    ends = [*starts, end]  # the first leg ends where the second one starts
+    if fell:
+        ends = ends[:-1]
     return [
         _change(velocity[a:b], command[a - 1 : b], position[a:b], dt)
-        for a, b in zip(starts, ends, strict=True)
+        for a, b in itertools.pairwise(ends)
     ]
 
 
