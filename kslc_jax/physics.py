@@ -14,6 +14,7 @@ import contextlib
 import functools
 import io
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import flax.struct
@@ -81,11 +82,24 @@ def step(
     target: jax.Array,
     dynamics: Dynamics,
     ground_friction: float,
+    force: jax.Array | None = None,
+    alter: Callable[[dict[str, jax.Array]], dict[str, jax.Array]] | None = None,
 ) -> PhysicsState:
-    """Advances one environment by one control step towards the joint targets [16, rad]."""
+    """Advances one environment by one control step towards the joint targets [16, rad].
+
+    Args:
+      config: engine and solver.
+      state: before the step.
+      target: joint angles [16, rad].
+      dynamics: how this robot differs from the described one.
+      ground_friction: see `model_fields`.
+      force: [nbody, 6] force [N] and torque [N m] on each body at its centre of mass, world frame.
+      alter: maps the mjModel fields of `model_fields` to those of a robot that differs in more.
+    """
     fields = model_fields(robot_for(config), dynamics, ground_friction)
+    fields = alter(fields) if alter else fields
     engine = _step_mujoco if resolve_engine(config) == "mujoco" else _step_mjx
-    return engine(config, state, target, dynamics, fields)
+    return engine(config, state, target, dynamics, fields, force)
 
 
 @functools.lru_cache(maxsize=8)
@@ -120,12 +134,15 @@ def _step_mjx(
     target: jax.Array,
     dynamics: Dynamics,
     fields: dict[str, jax.Array],
+    force: jax.Array | None,
 ) -> PhysicsState:
     robot = robot_for(config)
     model = _mjx_model(config).replace(**fields)
     data = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax").replace(
         qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
     )
+    if force is not None:
+        data = data.replace(xfrc_applied=force)
 
     def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
         torque, ctrl, bias = drive(robot, dynamics, data.qpos[7:], data.qvel[6:], target)
@@ -153,13 +170,14 @@ def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 # -------------------------------------------------------------------------------------- mujoco
 
-_batches: dict[tuple[Robot, int, int], mujoco.batch.Batch] = {}
+_batches: dict[Any, mujoco.batch.Batch] = {}
 _batches_lock = threading.Lock()
 
 
-def _batch(robot: Robot, size: int, threads: int) -> mujoco.batch.Batch:
-    """The cached simulator batch of this size; its state is overwritten at every call."""
-    key = (robot, size, threads)
+def _batch(robot: Robot, size: int, threads: int, written: frozenset[str]) -> mujoco.batch.Batch:
+    """The cached simulator batch of this size; its state and the fields `written` are overwritten
+    at every call, all others are the robot's."""
+    key = (robot, size, threads, written)
     if key not in _batches:
         _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
     return _batches[key]
@@ -171,6 +189,7 @@ def _step_mujoco(
     target: jax.Array,
     dynamics: Dynamics,
     fields: dict[str, jax.Array],
+    force: jax.Array | None,
 ) -> PhysicsState:
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
     return jax.pure_callback(
@@ -180,6 +199,7 @@ def _step_mujoco(
         target,
         dynamics,
         fields,
+        force,
         vmap_method="broadcast_all",
     )
 
@@ -190,6 +210,7 @@ def _host_step(
     target: np.ndarray,
     dynamics: Dynamics,
     fields: dict[str, np.ndarray],
+    force: np.ndarray | None,
 ) -> PhysicsState:
     """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us."""
     lead = np.shape(target)[:-1]
@@ -199,10 +220,13 @@ def _host_step(
         x = np.asarray(x, np.float64)
         return x.reshape(-1, *x.shape[len(lead) :])
 
-    state, dynamics, fields = jax.tree.map(rows, (state, dynamics, fields))
+    state, dynamics, fields, force = jax.tree.map(rows, (state, dynamics, fields, force))
     target = rows(target)
+    applied = {} if force is None else {"xfrc_applied": force}
     with _batches_lock:
-        batch = _batch(robot, len(target), config.threads)
+        batch = _batch(robot, len(target), config.threads, frozenset(fields | applied))
+        for name, value in applied.items():
+            batch.bind(name)[:] = value
         for name, value in fields.items():
             batch.expand(name)[:] = value
         qpos, qvel, warmstart = (batch.bind(n) for n in ("qpos", "qvel", "qacc_warmstart"))

@@ -1,10 +1,12 @@
-"""Figures from stored data: python -m kslc_jax.plots {training,learning,performance,momentum} ...
+"""Figures from stored data:
+python -m kslc_jax.plots {training,learning,performance,momentum,schedules} ...
 
 Examples:
   python -m kslc_jax.plots training runs/laptop-seed0 --out curve.png
   python -m kslc_jax.plots learning runs/compare/* --out learning.png
   python -m kslc_jax.plots performance runs/compare/*/evaluation.json --out performance.png
   python -m kslc_jax.plots momentum runs/compare/*/evaluation.json --out momentum.png
+  python -m kslc_jax.plots schedules sim2sim.json --out schedules.png
 """
 
 import json
@@ -20,6 +22,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+import tyro
 
 from kslc_jax import cli, files
 from kslc_jax.cli import Paths
@@ -266,6 +269,45 @@ def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
     _save(figure, out)
 
 
+def read_schedules(path: Path) -> list[dict]:
+    """Rows of the nominal robot of a sim2sim --schedule --json file; ValueError if it is none."""
+    try:
+        rows = json.loads(path.read_text())["conditions"]["nominal"]
+        _ = [row["series"]["forward"][0][0] for row in rows]
+    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{path} holds no schedules (of sim2sim --schedule --json)") from error
+    return rows
+
+
+def schedules(rows: list[dict], out: Path) -> None:
+    """Commanded and actual forward speed over time: a column per schedule, a row per robot."""
+    robots = max(len(row["series"]["forward"]) for row in rows)
+    size = (5 * len(rows), 2 * robots + 0.5)
+    figure, axes = plt.subplots(
+        robots,
+        len(rows),
+        figsize=size,
+        sharex=True,
+        sharey=True,
+        squeeze=False,
+        layout="constrained",
+    )
+    for column, row in zip(axes.T, rows, strict=True):
+        column[0].set_title(f"{row['schedule']}: {row['survival']:.0%} survived", fontsize=9)
+        lines = row["series"]
+        for axis, asked, actual in zip(column, lines["commanded"], lines["forward"], strict=False):
+            seconds = lines["every"] * np.arange(len(asked))
+            axis.plot(seconds, np.array(asked, float), "k:", linewidth=1, label="commanded")
+            axis.plot(seconds, np.array(actual, float), "C0", linewidth=1, label="actual")
+            if None in actual:
+                axis.axvline(lines["every"] * actual.index(None), color="C3", label="fell")
+            axis.grid(alpha=0.3)
+    figure.supxlabel("time [s]", fontsize=10)
+    figure.supylabel("forward speed [m/s]", fontsize=10)
+    _legend(figure, axes[0, 0])
+    _save(figure, out)
+
+
 def _save(figure, out: Path) -> None:
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -318,8 +360,20 @@ class Momentum:
     """Where the figure goes."""
 
 
-def draw(args: Training | Learning | Performance | Momentum) -> None:
+@dataclass(frozen=True)
+class Schedules:
+    """Commanded and actual speed over time of the first robots under each schedule."""
+
+    results: tyro.conf.Positional[Path]
+    """JSON file of sim2sim --schedule."""
+    out: Path = Path("schedules.png")
+    """Where the figure goes."""
+
+
+def draw(args: Training | Learning | Performance | Momentum | Schedules) -> None:
     """Draws the asked figure; ValueError where the data is missing."""
+    if isinstance(args, Schedules):
+        return schedules(read_schedules(args.results), args.out)
     if not (args.runs if isinstance(args, Training | Learning) else args.evaluations):
         raise ValueError("name at least one file or run folder")
     match args:
@@ -342,7 +396,7 @@ def _training(args: Training) -> None:
     learning_curve(runs, args.out)
 
 
-def _run(args: Training | Learning | Performance | Momentum) -> None:
+def _run(args: Training | Learning | Performance | Momentum | Schedules) -> None:
     try:
         draw(args)
     except ValueError as error:
@@ -352,7 +406,7 @@ def _run(args: Training | Learning | Performance | Momentum) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    kinds: Any = Training | Learning | Performance | Momentum
+    kinds: Any = Training | Learning | Performance | Momentum | Schedules
     return cli.run(lambda: _run(cli.parse("plots", kinds, argv, __doc__)))
 
 

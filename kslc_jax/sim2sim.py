@@ -3,8 +3,9 @@
 Sweeps commanded forward speeds x seeds with the deterministic policy in full C MuJoCo (1 ms, PD
 torque at every step, elliptic cones, converged solver, self-collision, joint friction) or, with
 --engine drake, in Drake, whose contact model and solver are its own. Prints the table of
-kslc_jax.evaluate; --perturb repeats the sweep on a changed robot or ground. How to read it:
-docs/sim2sim.md.
+kslc_jax.evaluate; --perturb repeats the sweep on a changed robot or ground. With --schedule the
+commands change during a trial, and the table says how the robots react. How to read both:
+docs/sim2sim.md. A * marks what the policy was not trained for.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
@@ -13,10 +14,17 @@ Examples:
   python -m kslc_jax.sim2sim runs/laptop-seed0 --noise --latency --perturb all --json out.json
   python -m kslc_jax.sim2sim runs/laptop-seed0 --perturb friction=0.2 payload=8 --speeds 1 2
   python -m kslc_jax.sim2sim runs/laptop-seed0 --speeds -0.3 0 0.5 --turn 1
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --schedule stop random --seeds 16 --json out.json
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --schedule my.json --punch 300 --heading 0 3.14159
   python -m kslc_jax.sim2sim runs/laptop-seed0 --engine drake --seconds 20 --seeds 2
+
+A schedule of one's own is a JSON list that starts over at its end; vy, yaw_rate and heading may be
+left out, a heading [rad, world] goes in place of a yaw_rate:
+  [{"seconds": 5, "vx": 3, "vy": 0, "yaw_rate": 0}, {"seconds": 4, "vx": 0, "heading": 1.57}]
 """
 
 import dataclasses
+import functools
 import math
 import sys
 from collections.abc import Callable
@@ -25,14 +33,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
+from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from kslc_jax import cli, evaluate, files
-from kslc_jax.config import ConfigError, HighFidelity, RandomizeConfig, require_seed
+from kslc_jax.config import ConfigError, HighFidelity, require_seed
 from kslc_jax.errors import MissingPackage
-from kslc_jax.evaluation import tables
-from kslc_jax.evaluation.tables import Row
+from kslc_jax.evaluation import schedules, tables
+from kslc_jax.evaluation.perturbations import ALL, changes, settings
 
 if TYPE_CHECKING:
     from kslc_jax.evaluation.trials import Setting
@@ -40,30 +49,8 @@ if TYPE_CHECKING:
 
 Engine = Literal["mujoco", "drake"]
 
-PUSH_SECONDS = 4.0
-"""Time between pushes."""
-
-PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
-    "friction": lambda mu: {"friction": (mu, mu), "ground_friction": mu},
-    "payload": lambda kg: {"base_mass": (kg, kg)},
-    "com": lambda metres: {"base_com": (metres, metres)},
-    "push": lambda speed: {
-        "push_seconds": PUSH_SECONDS,
-        "push_velocity": speed,
-        "push_angular": 0.0,
-    },
-    "gains": lambda factor: {"kp": (factor, factor), "kd": (factor, factor)},
-    "strength": lambda factor: {"motor_strength": (factor, factor)},
-    "imu": lambda angle: {"imu_offset": (angle, angle)},
-}
-"""Name -> changes of RandomizeConfig or trials.Setting for a value."""
-
-ALL = (
-    *("friction=0.3", "friction=0.6", "friction=1.5"),
-    *("payload=-5", "payload=5", "com=-0.02", "com=0.02", "push=0.5"),
-    *("gains=0.85", "gains=1.15", "strength=0.9", "imu=0.03"),
-)
-"""What `--perturb all` runs."""
+MOST_LATENCY = 50
+"""Control steps by which actions may come late."""
 
 
 @dataclass(frozen=True)
@@ -87,13 +74,28 @@ class Args:
     """Length of a trial."""
     noise: bool = False
     """Sensor noise, action delay and action noise, the most that training has."""
-    latency: bool = False
-    """Every action comes one control step late."""
+    latency: int = 0
+    """Control steps by which every action comes late; --latency alone means 1."""
+    schedule: tuple[str, ...] = ()
+    """Commands that change during a trial, in place of --speeds: stop (top speed 5 s, rest 4 s),
+    reverse (top 5 s, backwards 4 s), box (every 4 s a command as training draws them), random
+    (every 1 to 4 s, with stops and reversals from the top), jitter (every 0.3 to 4 s), turns (at
+    three speeds), tour (way-points), or a JSON file."""
+    top: float | None = None
+    """Fastest speed of a schedule [m/s]; None: the fastest that the policy was trained for."""
+    heading: tuple[float, ...] = (0.0,)
+    """Where robots head at the start [rad]; with several the first is the nominal one."""
+    punch: float = 0.0
+    """Force [N] for 0.08 s at a random link in a random direction every 4 s."""
+    hold_arms: bool = False
+    """The arms' targets walk at random, at most 0.3 rad/s, whatever the policy asks for."""
     perturb: tuple[str, ...] = ()
     """Repeat the sweep with each of these: friction=MU, payload=KG on the base, com=M (the base's
     centre of mass forwards, to the left and up), push=M/S (largest push along x and y, every 4 s),
     gains=FACTOR on kp and kd, strength=FACTOR on the motors' torque, imu=RAD (constant error of
-    roll and pitch); all: a list of twelve."""
+    roll and pitch), links=SHARE (each link's mass differs by up to it), hands=KG at each hand,
+    sole=M (a sole's sides wander by up to it), joints=X (up to X N m of friction and N m s/rad of
+    damping more in each joint), heading=RAD; all: a list of sixteen."""
     seed: int = 0
     """Of initial states."""
     json: Path | None = None
@@ -104,33 +106,26 @@ class Args:
         require_seed(self.seed)
         if not all(map(math.isfinite, (self.sideways, self.turn))):
             raise ConfigError("sideways and turn must be finite")
+        if not (self.heading and all(map(math.isfinite, self.heading))):
+            raise ConfigError("heading: name at least one, finite")
+        if not 0 <= self.latency <= MOST_LATENCY:
+            raise ConfigError(f"latency must lie in 0 to {MOST_LATENCY} control steps")
+        if not (math.isfinite(self.punch) and self.punch >= 0):
+            raise ConfigError("punch must be a force in newtons, not negative")
+        if self.top is not None and not (math.isfinite(self.top) and self.top > 0):
+            raise ConfigError("top must be a positive speed")
         for name in self.conditions:
-            changes(name)
+            made = changes(name)
+            if self.engine == "drake" and (self.punch or "variation" in made):
+                raise ConfigError("punches, links, hands, sole and joints need --engine mujoco")
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """What to run, the unperturbed robot first."""
-        asked = (c for name in self.perturb for c in (ALL if name == "all" else (name,)))
-        return tuple(dict.fromkeys(("nominal", *asked)))
-
-
-def changes(condition: str) -> dict[str, Any]:
-    """What 'nominal' or a perturbation such as 'payload=5' changes; ConfigError if unknown."""
-    if condition == "nominal":
-        return {}
-    name, _, value = condition.partition("=")
-    try:
-        if not math.isfinite(float(value)):
-            raise ValueError
-        made = PERTURBATIONS[name](float(value))
-        RandomizeConfig(**{k: v for k, v in made.items() if k in _ROBOT})
-    except (KeyError, ValueError):
-        known = ", ".join(f"{name}=X" for name in PERTURBATIONS)
-        raise ConfigError(f"perturb: cannot read {condition!r} (known: {known}, all)") from None
-    return made
-
-
-_ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
+        every = [c for c in ALL if self.engine == "mujoco" or "variation" not in changes(c)]
+        asked = (c for name in self.perturb for c in (every if name == "all" else (name,)))
+        turned = (f"heading={yaw:g}" for yaw in self.heading[1:])
+        return tuple(dict.fromkeys(("nominal", *turned, *asked)))
 
 
 def simulator(engine: Engine):
@@ -149,21 +144,26 @@ def setting(args: Args, condition: str) -> "Setting":
     """The conditions of one sweep."""
     from kslc_jax.evaluation import trials
 
-    made = changes(condition)
-    robot = {name: value for name, value in made.items() if name in _ROBOT}
-    rest = {name: value for name, value in made.items() if name not in _ROBOT}
-    return trials.Setting(
+    plain = trials.Setting(
         HighFidelity(),
-        randomize=dataclasses.replace(trials.NOMINAL, **robot),
         seconds=args.seconds,
         noise=args.noise,
         latency=args.latency,
+        punch=args.punch,
+        hold_arms=args.hold_arms,
+        heading=args.heading[0],
         simulate=simulator(args.engine),
-        **rest,
     )
+    return dataclasses.replace(plain, **settings(changes(condition), plain.randomize))
 
 
-Results = dict[str, list[Row]]
+CONDITIONS = (
+    *("engine", "sideways", "turn", "seeds", "seconds", "noise", "latency", "seed"),
+    *("schedule", "top", "heading", "punch", "hold_arms"),
+)
+"""Options that the JSON repeats."""
+
+Results = dict[str, list[dict[str, Any]]]
 
 
 def sweeps(
@@ -171,22 +171,33 @@ def sweeps(
     policy: "Policy",
     progress: Callable[[str, float], None] = lambda condition, share: None,
 ) -> Results:
-    """Rows of `measure` for every condition; `progress` is told where it is."""
-    from kslc_jax.evaluation.measure import measure
-
+    """Rows for every condition, of `measure` or of `scheduled.measure`; `progress` is told where it
+    is."""
     return {
-        condition: measure(
-            policy,
-            setting(args, condition),
-            args.speeds,
-            args.seeds,
-            args.seed,
-            lambda share, condition=condition: progress(condition, share),
-            vy=args.sideways,
-            yaw_rate=args.turn,
-        )
+        condition: _rows(args, policy, condition, functools.partial(progress, condition))
         for condition in args.conditions
     }
+
+
+def _rows(
+    args: Args, policy: "Policy", condition: str, progress: Callable[[float], None]
+) -> list[dict[str, Any]]:
+    """The rows of one condition, with the reasons why they lie beyond the training."""
+    from kslc_jax.evaluation import scheduled, trained
+    from kslc_jax.evaluation.measure import measure
+
+    conditions = setting(args, condition)
+    if args.schedule:
+        v_max = float(policy.curriculum.v_max)
+        plans = [schedules.named(n, policy.config, v_max, args.top) for n in args.schedule]
+        return scheduled.measure(policy, conditions, plans, args.seeds, args.seed, progress)
+    vy, yaw_rate = args.sideways, args.turn
+    rows = measure(
+        policy, conditions, args.speeds, args.seeds, args.seed, progress, vy=vy, yaw_rate=yaw_rate
+    )
+    return [
+        row | trained.beyond(policy, conditions, (row["command"], vy, yaw_rate)) for row in rows
+    ]
 
 
 def summary(results: Results, title: str) -> Table:
@@ -201,8 +212,17 @@ def summary(results: Results, title: str) -> Table:
     return out
 
 
+def with_latency(argv: list[str]) -> list[str]:
+    """The command line with a 1 after a `--latency` that has no number."""
+    out: list[str] = []
+    for word, after in zip(argv, [*argv[1:], ""], strict=True):
+        out += [word, "1"] if word == "--latency" and not after.isdigit() else [word]
+    return out
+
+
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
+    argv = with_latency(sys.argv[1:] if argv is None else argv)
     return cli.run(lambda: _report(cli.parse("sim2sim", Args, argv, __doc__)))
 
 
@@ -213,6 +233,8 @@ def _report(args: Args) -> None:
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
+    for name in args.schedule:  # told before any trial
+        schedules.named(name, policy.config, float(policy.curriculum.v_max), args.top)
     screen = tables.console()
     # Reports come once a simulated second: the estimate of the time left needs a long memory.
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
@@ -223,7 +245,20 @@ def _report(args: Args) -> None:
             bar.update(tasks[condition], completed=share)
 
         results = sweeps(args, policy, progress)
-    title = f"{args.policy}, train step {policy.step}, {args.engine}"
+    _show(args, screen, results, f"{args.policy}, train step {policy.step}, {args.engine}")
+    if args.json is not None:
+        what = {"policy": str(args.policy), "step": policy.step}
+        how = {name: getattr(args, name) for name in CONDITIONS}
+        files.write_json(args.json, {**what, **how, "conditions": results})
+
+
+def _show(args: Args, screen: Console, results: Results, title: str) -> None:
+    """Prints the tables."""
+    if args.schedule:
+        from kslc_jax.evaluation import scheduled
+
+        screen.print(scheduled.table(results, title))
+        return
     columns = tables.HEADLINE
     if args.sideways or args.turn:
         title += f", with {args.sideways:g} m/s sideways and {args.turn:g} rad/s"
@@ -232,11 +267,6 @@ def _report(args: Args) -> None:
         screen.print(tables.table(rows, f"{title}, {condition}", columns))
     if len(results) > 1:
         screen.print(summary(results, title))
-    if args.json is not None:
-        what = {"policy": str(args.policy), "step": policy.step}
-        names = ("engine", "sideways", "turn", "seeds", "seconds", "noise", "latency", "seed")
-        how = {name: getattr(args, name) for name in names}
-        files.write_json(args.json, {**what, **how, "conditions": results})
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import tyro
 
 import kslc_jax.evaluation
 from kslc_jax import curriculum, env, networks, randomize, robot, sim2sim
@@ -29,7 +30,7 @@ def random_policy():
 def frozen(monkeypatch):
     """An environment that only shows the action it was sent, as its torque, and ends."""
 
-    def step(config, state, action, key, curriculum):
+    def step(config, state, action, key, curriculum, simulate):
         shown = state.replace(physics=state.physics.replace(torque=action))
         fell = jax.numpy.ones((), bool)
         return shown, env.Outcome(**dict.fromkeys(env.Outcome.__dataclass_fields__, fell))
@@ -96,25 +97,54 @@ def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
     assert float(fields["body_mass"].sum()) == pytest.approx(trace.mass[0, 0], abs=1e-4)
 
 
-def test_all_runs_twelve_perturbations_after_the_nominal_robot():
+def test_all_runs_sixteen_perturbations_after_the_nominal_robot():
     conditions = sim2sim.Args("x", perturb=("all",)).conditions
     more = sim2sim.Args("x", perturb=("all", "friction=0.2", "payload=5")).conditions
-    assert more == (*conditions, "friction=0.2")  # payload=5 is one of the twelve
-    assert conditions[0] == "nominal" and len(set(conditions)) == 13
+    assert more == (*conditions, "friction=0.2")  # payload=5 is one of the sixteen
+    assert conditions[0] == "nominal" and len(set(conditions)) == 17
 
 
-@pytest.mark.parametrize("name", ["wind=3", "payload", "payload=heavy", "payload=-30", "all=1"])
+def test_drake_runs_what_it_can():
+    """Robots whose links, hands, soles or joints differ need MuJoCo."""
+    conditions = sim2sim.Args("x", engine="drake", perturb=("all",)).conditions
+    assert len(conditions) == 13 and "links=0.1" not in conditions
+    for what in ({"perturb": ("links=0.1",)}, {"punch": 100.0}):
+        with pytest.raises(ConfigError, match="need --engine mujoco"):
+            sim2sim.Args("x", engine="drake", **what)
+
+
+def test_headings_are_conditions():
+    """The first one is that of all others."""
+    args = sim2sim.Args("x", heading=(np.pi, 0.5), perturb=("payload=5",))
+    assert args.conditions == ("nominal", "heading=0.5", "payload=5")
+    assert [sim2sim.setting(args, c).heading for c in args.conditions] == [np.pi, 0.5, np.pi]
+
+
+@pytest.mark.parametrize(
+    "name", ["wind=3", "payload", "payload=heavy", "payload=-30", "all=1", "links=2", "sole=0.2"]
+)
 def test_perturbations_that_cannot_be_are_refused(name):
     with pytest.raises(ConfigError):
         sim2sim.Args("x", perturb=(name,))
 
 
-def test_latency_sends_the_action_before(random_policy, frozen):
-    """In the first step there is none, which asks for the default pose."""
-    sent, history = actions(random_policy, latency=True)
+@pytest.mark.parametrize("steps", [1, 2])
+def test_latency_sends_an_action_of_some_steps_before(random_policy, frozen, steps):
+    """In the first steps there is none, which asks for the default pose."""
+    sent, history = actions(random_policy, latency=steps)
     decided = random_policy.act_on(history)
     assert np.abs(decided).max() > 0.01
-    np.testing.assert_allclose(sent, [0.0 * decided, decided, decided], atol=1e-6)
+    late = [[0.0 * decided, decided][i >= steps] for i in range(3)]
+    np.testing.assert_allclose(sent, late, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "steps"), [("", 0), ("--latency", 1), ("--latency --noise", 1), ("--latency 3", 3)]
+)
+def test_latency_alone_is_one_step(words, steps):
+    argv = sim2sim.with_latency(["p", *words.split()])
+    assert tyro.cli(sim2sim.Args, args=argv).latency == steps
+    assert tyro.cli(sim2sim.Args, args=sim2sim.with_latency([*words.split(), "p"])).policy.name
 
 
 def test_imu_offset_is_an_error_of_roll_and_pitch(random_policy, frozen):
@@ -183,6 +213,9 @@ def test_a_side_step_and_a_turn_are_commanded_with_every_speed(random_policy, mo
         (["x", "--seconds", "2"], "seconds must be a whole number from 3"),
         (["x", "--turn", "nan"], "sideways and turn must be finite"),
         (["x", "--seeds", "0"], "seeds must be positive"),
+        (["x", "--latency", "99"], "latency must lie in 0 to 50"),
+        (["x", "--punch", "-1"], "punch must be a force"),
+        (["x", "--top", "0"], "top must be a positive speed"),
         (["x", "--perturb", "wind=3"], "cannot read 'wind=3'"),
     ],
 )

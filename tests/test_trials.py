@@ -100,6 +100,8 @@ def synthetic(seconds=11.6, frequency=1.25, speed=2.0):
         contact=contact,
         foot_height=np.where(contact, 0.05, 0.15),
         angular_momentum=zeros + np.array([0.0, 3.0, 4.0]),
+        command=zeros + np.array([speed, 0, 0]),
+        leg=np.zeros((steps, n), int),
     )
 
 

@@ -1,1 +1,2 @@
-"""Judging a policy: trials under fixed commands and the metrics of a gait. Imports no training."""
+"""Judging a policy: commands that hold or change, disturbances, robots that differ, metrics of the
+gait, and the bars. Imports no training."""

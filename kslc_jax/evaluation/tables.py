@@ -39,14 +39,17 @@ SIDEWAYS_COLUMNS: Columns = (
 
 
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
-    """The numbers of those columns, one line per commanded speed."""
-    out = Table(title=title, title_justify="left")
+    """The numbers of those columns, one line per commanded speed. A row with `beyond` in it gets an
+    asterisk."""
+    marked = any("beyond" in row for row in rows)
+    caption = "* beyond what the policy was trained for" if marked else None
+    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     out.add_column("command [m/s]", justify="right")
     for _, label, _ in columns:
         out.add_column(label, justify="right")
     for row in rows:
         cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
-        out.add_row(f"{row['command']:.1f}", *cells)
+        out.add_row(f"{row['command']:.1f}" + "*" * ("beyond" in row), *cells)
     return out
 
 

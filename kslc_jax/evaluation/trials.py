@@ -1,5 +1,5 @@
-"""Trials: a trained policy under fixed commands, in the environment it was trained in or in full
-C MuJoCo at high fidelity. One code path for both: only the physics config differs.
+"""Trials: a trained policy under fixed or changing commands, in the environment it was trained in
+or in full C MuJoCo at high fidelity. One code path for both: only the physics config differs.
 """
 
 import dataclasses
@@ -12,10 +12,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import commands, env, networks, observations, physics, signals
+from kslc_jax import commands, env, maths, networks, observations, physics, signals
 from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.evaluation import disturbances, schedules, variation
+from kslc_jax.evaluation.schedules import Leg, Schedule
+from kslc_jax.evaluation.variation import Body, Variation
 from kslc_jax.policy import Policy
+from kslc_jax.robot import Robot
 
 NOMINAL = RandomizeConfig(
     friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0
@@ -40,12 +44,22 @@ class Setting:
     seconds: float = 20.0
     noise: bool = False
     """Sensor noise, action delay and action noise, the most that training has."""
-    latency: bool = False
-    """Every action comes one control step late."""
+    latency: int = 0
+    """Control steps by which every action comes late."""
     imu_offset: tuple[float, float] = (0.0, 0.0)
     """Constant error of the roll and pitch that the policy sees [rad]."""
     simulate: Callable[..., physics.PhysicsState] | None = None
     """Another engine, with the signature of `physics.step`; None takes that of `physics`."""
+    schedule: Schedule | None = None
+    """Commands that change; None holds one command per robot."""
+    heading: float = 0.0
+    """Where the robot heads at the start, and until a command says otherwise [rad]."""
+    punch: float = 0.0
+    """Force [N] at a random link every `disturbances.PUNCH_EVERY` seconds."""
+    hold_arms: bool = False
+    """The arms' targets walk at random, whatever the policy asks for."""
+    variation: Variation = variation.NOMINAL
+    """How robots differ beside `randomize`."""
 
 
 @flax.struct.dataclass
@@ -63,6 +77,22 @@ class Trace:
     contact: jax.Array  # [2] bool, left and right foot
     foot_height: jax.Array  # [2] m, ankle-roll link
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
+    command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s] that the step was done under
+    leg: jax.Array  # int, number of the schedule's leg
+
+
+@flax.struct.dataclass
+class Trial:
+    """What a trial carries from step to step, of one robot."""
+
+    env: env.EnvState
+    alive: jax.Array  # [] bool
+    queue: jax.Array  # [latency, 16] actions that are still to come, the next one first
+    leg: Leg
+    arms: jax.Array  # [16] rad, targets of held arms
+    body: Body
+    key: jax.Array  # the robot's own
+    steps: jax.Array  # [] int, control steps done
 
 
 def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
@@ -110,52 +140,128 @@ def run(
       policy: acts deterministically.
       setting: conditions.
       velocities: [N, 3] commanded vx, vy [m/s] and, by heading, yaw rate [rad/s]. With a yaw rate
-        of 0 the robot is asked to keep its heading, as in training.
+        of 0 the robot is asked to keep its heading, as in training. With a schedule only N counts.
       seed: of initial states and randomisation.
       chunk: seconds per piece.
     """
     count = len(velocities)
-    reset, advance = _programs(policy.config, setting, count, env.step)
-    wanted = jnp.asarray(velocities, jnp.float32)
+    compiled = dataclasses.replace(setting, seconds=0.0, heading=0.0)  # for any of these two
+    start, advance = _programs(policy.config, compiled, count, env.step)
+    legs = jnp.asarray(velocities, jnp.float32), jnp.float32(setting.heading)
     key_reset, key_run = jax.random.split(jax.random.key(seed))
-    states = reset(policy.curriculum, jax.random.split(key_reset, count))
-    carry = states, jnp.ones(count, bool), states.last_action
+    carry = start(policy.curriculum, *legs, jax.random.split(key_reset, count))
+    # On a named device, like the loaded parameters: else the second piece compiles once more.
+    carry = jax.device_put(carry, jax.devices()[0])
     steps = round(chunk / setting.physics.control_dt)
     for i in range(round(setting.seconds / chunk)):
         step_keys = jax.random.split(jax.random.fold_in(key_run, i), steps)
-        carry, trace = advance(policy.params, policy.curriculum, wanted, carry, step_keys)
+        carry, trace = advance(policy.params, policy.curriculum, carry, step_keys)
         yield jax.tree.map(np.asarray, trace)
 
 
 @functools.lru_cache(maxsize=4)
 def _programs(trained: Config, setting: Setting, count: int, step: Callable):
-    """(reset, advance) of `count` environments, jitted once for all policies of a config."""
+    """(start, advance) of `count` environments, jitted once for all policies of a config."""
     config = trial_config(trained, setting, count)
-    robot = physics.robot_for(config.physics)
-    error = _frame_error(setting)
-    if setting.simulate:
-        step = functools.partial(step, simulate=setting.simulate)
 
-    def one(policy: Policy, wanted: jax.Array, carry, key: jax.Array):
-        state, alive, last_action = carry
-        state = jax.vmap(lambda s, v: with_command(config, s, v))(state, wanted)
-        action = jax.vmap(policy.act_on)(state.history + error)
-        sent = last_action if setting.latency else action
-        keys = jax.random.split(key, count)
-        state, outcome = jax.vmap(step, (None, 0, 0, 0, None))(
-            config, state, sent, keys, policy.curriculum
-        )
-        alive = alive & ~outcome.terminated
-        return (state, alive, action), _record(robot, state, alive)
+    def start(curriculum: Curriculum, wanted: jax.Array, heading: jax.Array, keys) -> Trial:
+        begin = functools.partial(_start, config, setting, curriculum)
+        return jax.vmap(begin, (0, None, 0))(wanted, heading, keys)
 
-    def advance(params: networks.Params, curriculum: Curriculum, wanted, carry, keys):
+    def advance(params: networks.Params, curriculum: Curriculum, trials: Trial, keys: jax.Array):
         policy = Policy(trained, params, curriculum, step=0)
-        return jax.lax.scan(functools.partial(one, policy, wanted), carry, keys)
+        one = functools.partial(_advance, config, setting, step, policy)
 
-    def reset(curriculum: Curriculum, keys: jax.Array):
-        return jax.vmap(env.reset, (None, 0, None))(config, keys, curriculum)
+        def all_of_them(trials: Trial, key: jax.Array) -> tuple[Trial, Trace]:
+            return jax.vmap(one)(trials, jax.random.split(key, count))
 
-    return jax.jit(reset), jax.jit(advance)
+        return jax.lax.scan(all_of_them, trials, keys)
+
+    return jax.jit(start), jax.jit(advance)
+
+
+def _start(
+    config: Config, setting: Setting, curriculum: Curriculum, wanted: jax.Array, heading, key
+) -> Trial:
+    """One robot at rest that heads to `heading` [rad], under the command `wanted` [3] if there is
+    no schedule."""
+    robot = physics.robot_for(config.physics)
+    state = env.reset(config, key, curriculum)
+    own, key_body = jax.random.split(jax.random.fold_in(key, 1))
+    leg = schedules.constant(wanted, heading)
+    if setting.schedule:
+        leg = schedules.before_start(heading)
+    return Trial(
+        env=_face(state, heading),
+        alive=jnp.ones((), bool),
+        queue=jnp.zeros((setting.latency, len(state.last_action))),
+        leg=leg,
+        arms=state.physics.qpos[7:],
+        body=variation.sample(setting.variation, robot, key_body),
+        key=own,
+        steps=jnp.zeros((), jnp.int32),
+    )
+
+
+def _face(state: env.EnvState, heading: jax.Array) -> env.EnvState:
+    """The robot that heads to yaw 0, turned to `heading` [rad], and so shown in its first frame."""
+    zero = jnp.zeros(())
+    quat = jnp.stack([jnp.cos(heading / 2), zero, zero, jnp.sin(heading / 2)])
+    at = observations.slices(observations.ACTOR)["base_euler"].stop - 1
+    yaw = maths.quat_to_euler(quat)[2]
+    return state.replace(
+        physics=state.physics.replace(qpos=state.physics.qpos.at[3:7].set(quat)),
+        history=state.history.at[-1, at].add(yaw),
+    )
+
+
+def _advance(
+    config: Config, setting: Setting, step: Callable, policy: Policy, trial: Trial, key: jax.Array
+) -> tuple[Trial, Trace]:
+    """One control step of one robot."""
+    robot, dt = physics.robot_for(config.physics), config.control_dt
+    leg, arms = trial.leg, trial.arms
+    if setting.schedule:
+        qpos = trial.env.physics.qpos
+        yaw = maths.quat_to_euler(qpos[3:7])[2]
+        leg = schedules.update(setting.schedule, config.command, leg, trial.key, yaw, qpos[:2], dt)
+    if setting.hold_arms:
+        arms = disturbances.walk_arms(robot, arms, trial.key, trial.steps, dt)
+    state = with_command(config, trial.env, leg.velocity, leg.heading)
+    action = policy.act_on(state.history + _frame_error(setting))
+    queue = jnp.concatenate([trial.queue, action[None]])
+    simulate = _simulator(config, setting, robot, trial.replace(arms=arms), key)
+    after, outcome = step(config, state, queue[0], key, policy.curriculum, simulate=simulate)
+    trial = trial.replace(
+        env=after,
+        alive=trial.alive & ~outcome.terminated,
+        queue=queue[1:],
+        leg=leg,
+        arms=arms,
+        steps=trial.steps + 1,
+    )
+    mass = variation.total_mass(setting.variation, robot, trial.body, after.dynamics.base_mass)
+    return trial, _record(robot, trial, state.command.velocity, mass)
+
+
+def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key: jax.Array):
+    """The engine under the setting's disturbances, with the signature of `physics.step`."""
+    engine, more = setting.simulate or physics.step, {}
+    if setting.punch:
+        more["force"] = disturbances.punch(
+            robot, setting.punch, trial.key, trial.steps, config.control_dt
+        )
+    if setting.variation != variation.NOMINAL:
+        key_body = jax.random.fold_in(key, 1)
+        more["alter"] = functools.partial(
+            variation.alter, setting.variation, robot, trial.body, key_body
+        )
+
+    def simulate(config: PhysicsConfig, state: physics.PhysicsState, target: jax.Array, *rest):
+        target = jnp.where(robot.is_arm & setting.hold_arms, trial.arms, target)
+        return engine(config, state, target, *rest, **more)
+
+    return simulate
 
 
 def _frame_error(setting: Setting) -> np.ndarray:
@@ -166,12 +272,13 @@ def _frame_error(setting: Setting) -> np.ndarray:
     return error
 
 
-def _record(robot, state: env.EnvState, alive: jax.Array) -> Trace:
-    now = jax.vmap(lambda s: signals.read(robot, s))(state.physics)
+def _record(robot: Robot, trial: Trial, command: jax.Array, mass: jax.Array) -> Trace:
+    state = trial.env.physics
+    now = signals.read(robot, state)
     return Trace(
-        alive=alive,
-        mass=robot.total_mass + state.dynamics.base_mass,
-        qpos=state.physics.qpos,
+        alive=trial.alive,
+        mass=mass,
+        qpos=state.qpos,
         linvel=now.base_linvel,
         angvel=now.base_angvel,
         euler=now.base_euler,
@@ -180,6 +287,8 @@ def _record(robot, state: env.EnvState, alive: jax.Array) -> Trace:
         contact=now.foot_contact,
         foot_height=now.foot_pos[..., 2],
         angular_momentum=now.angular_momentum,
+        command=command,
+        leg=trial.leg.number,
     )
 
 

@@ -1,0 +1,121 @@
+"""The bars that a policy has to meet, read from what `kslc_jax.judge` measured. Pure Python."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+Row = dict[str, Any]
+
+TOP = 4.0
+"""Fastest command [m/s] at which nobody may fall."""
+
+GAIT_TOP = 3.5
+"""Fastest command [m/s] at which joints keep their limits and the base stays calm."""
+
+PERTURBED_TOP = 3.0
+"""Fastest command [m/s] at which perturbed robots stay up."""
+
+SLOWEST = 0.5
+"""Slowest command [m/s] with a gait to judge."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One demand, and what came of it."""
+
+    name: str
+    wanted: str
+    value: float | None  # the worst that was measured; None if nothing was
+    where: str  # where it was the worst
+    met: bool
+
+    def shown(self) -> str:
+        """The value as text."""
+        return "-" if self.value is None else f"{self.value:.3g}"
+
+
+def bars(results: dict[str, Any]) -> list[Bar]:
+    """All bars.
+
+    Args:
+      results: of `judge.measure`. "speeds": rows by commanded speed; "schedules" and "perturbed":
+        rows by condition; "drake": rows, if it was asked for.
+    """
+    speeds: list[Row] = results["speeds"]
+    gait, calm = _between(speeds, SLOWEST, TOP), _between(speeds, SLOWEST, GAIT_TOP)
+    flight = [row for row in speeds if row["command"] == GAIT_TOP]
+    rest = [row for row in speeds if row["command"] == 0.0]
+    found = [
+        _at_least("nobody falls, 0 to 4 m/s", 1.0, _upright(_between(speeds, 0.0, TOP))),
+        _at_most("speed error, 0.5 to 4 m/s, share", 0.03, _each(gait, _speed_error)),
+        _at_most("speed at command 0 [m/s]", 0.03, _each(rest, _creep)),
+        _at_most("strides a second at command 0", 0.05, _of(rest, "stride_frequency")),
+        _at_least("nobody falls, random schedule", 1.0, _by_condition(results["schedules"])),
+        _at_least("joints within speed limits, to 3.5 m/s", 0.99, _of(calm, "within_speed_limits")),
+        _at_most("arm-leg correlation", -0.5, _of(gait, "shoulder_hip_correlation")),
+        _at_most("left-right difference", 0.05, _each(gait, _asymmetry)),
+        _at_most("lateral std, to 3.5 m/s [m/s]", 0.1, _of(calm, "lateral_std")),
+        _at_most("yaw-rate std, to 3.5 m/s [rad/s]", 0.25, _of(calm, "yaw_rate_std")),
+        _at_least("flight at 3.5 m/s", 0.1, _of(flight, "flight_share")),
+        _at_least("nobody falls, perturbed, to 3 m/s", 1.0, _by_condition(results["perturbed"])),
+    ]
+    if "drake" in results:
+        found.append(_at_least("nobody falls, Drake, to 4 m/s", 1.0, _upright(results["drake"])))
+    return found
+
+
+Measured = list[tuple[float, str]]
+"""Values, and where each was measured."""
+
+
+def _at_least(name: str, bound: float, measured: Measured) -> Bar:
+    value, where = min(measured, default=(None, "not measured"))
+    return Bar(name, f">= {bound:g}", value, where, value is not None and value >= bound)
+
+
+def _at_most(name: str, bound: float, measured: Measured) -> Bar:
+    value, where = max(measured, default=(None, "not measured"))
+    return Bar(name, f"<= {bound:g}", value, where, value is not None and value <= bound)
+
+
+def _between(rows: Iterable[Row], low: float, high: float) -> list[Row]:
+    return [row for row in rows if low <= row["command"] <= high]
+
+
+def _place(row: Row) -> str:
+    return f"{row['command']:g} m/s" if "command" in row else row["schedule"]
+
+
+def _of(rows: Iterable[Row], name: str) -> Measured:
+    """A number of each row; rows in which all robots fell have none."""
+    return [(row[name], _place(row)) for row in rows if name in row]
+
+
+def _upright(rows: Iterable[Row]) -> Measured:
+    return _of(rows, "survival")
+
+
+def _each(rows: Iterable[Row], number: Callable[[Row], float | None]) -> Measured:
+    values = [(number(row), _place(row)) for row in rows]
+    return [(value, where) for value, where in values if value is not None]
+
+
+def _by_condition(conditions: dict[str, list[Row]]) -> Measured:
+    return [
+        (value, f"{condition}, {where}")
+        for condition, rows in conditions.items()
+        for value, where in _upright(rows)
+    ]
+
+
+def _speed_error(row: Row) -> float:
+    """|mean vx - command| / command, where a fallen robot counts as 0 m/s."""
+    return abs(row["forward_mean"] - row["command"]) / row["command"]
+
+
+def _creep(row: Row) -> float:
+    return max(abs(row["forward_mean"]), abs(row.get("lateral_mean", 0.0)))
+
+
+def _asymmetry(row: Row) -> float | None:
+    return max((value for name, value in row.items() if name.endswith("_difference")), default=None)

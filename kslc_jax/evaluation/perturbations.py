@@ -1,0 +1,70 @@
+"""Perturbations by name: friction=0.3, payload=5, links=0.1, ... and what they change."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+from kslc_jax.config import ConfigError, RandomizeConfig
+from kslc_jax.evaluation.variation import Variation
+
+PUSH_SECONDS = 4.0
+"""Time between pushes."""
+
+PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
+    "friction": lambda mu: {"friction": (mu, mu), "ground_friction": mu},
+    "payload": lambda kg: {"base_mass": (kg, kg)},
+    "com": lambda metres: {"base_com": (metres, metres)},
+    "push": lambda speed: {
+        "push_seconds": PUSH_SECONDS,
+        "push_velocity": speed,
+        "push_angular": 0.0,
+    },
+    "gains": lambda factor: {"kp": (factor, factor), "kd": (factor, factor)},
+    "strength": lambda factor: {"motor_strength": (factor, factor)},
+    "imu": lambda angle: {"imu_offset": (angle, angle)},
+    "links": lambda share: {"variation": Variation(links=share)},
+    "hands": lambda kg: {"variation": Variation(hands=kg)},
+    "sole": lambda metres: {"variation": Variation(sole=metres)},
+    "joints": lambda most: {"variation": Variation(joints=most)},
+    "heading": lambda yaw: {"heading": yaw},
+}
+"""Name -> changes of RandomizeConfig or trials.Setting for a value."""
+
+ALL = (
+    *("friction=0.3", "friction=0.6", "friction=1.5"),
+    *("payload=-5", "payload=5", "com=-0.02", "com=0.02", "push=0.5"),
+    *("gains=0.85", "gains=1.15", "strength=0.9", "imu=0.03"),
+    *("links=0.1", "hands=0.5", "sole=0.02", "joints=1"),
+)
+"""What `--perturb all` runs."""
+
+ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
+"""Changes that belong in `trials.Setting.randomize`."""
+
+
+def changes(condition: str) -> dict[str, Any]:
+    """Changes that 'nominal' or a perturbation such as 'payload=5' makes; ConfigError if
+    unknown."""
+    if condition == "nominal":
+        return {}
+    name, _, value = condition.partition("=")
+    try:
+        if not math.isfinite(float(value)):
+            raise ValueError
+        made = PERTURBATIONS[name](float(value))
+        RandomizeConfig(**{k: v for k, v in made.items() if k in ROBOT})
+    except ConfigError as error:
+        raise ConfigError(f"perturb: {condition}: {error}") from None
+    except (KeyError, ValueError):
+        known = ", ".join(f"{name}=X" for name in PERTURBATIONS)
+        raise ConfigError(f"perturb: cannot read {condition!r} (known: {known}, all)") from None
+    return made
+
+
+def settings(made: dict[str, Any], randomize: RandomizeConfig) -> dict[str, Any]:
+    """Fields of `trials.Setting` for the `changes` of a condition, to robots that else are as
+    `randomize` says."""
+    robot = {name: value for name, value in made.items() if name in ROBOT}
+    rest = {name: value for name, value in made.items() if name not in ROBOT}
+    return rest | {"randomize": dataclasses.replace(randomize, **robot)}

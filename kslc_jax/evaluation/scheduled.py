@@ -1,0 +1,79 @@
+"""Trials of a policy under schedules: rows of numbers, and their table."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from kslc_jax.evaluation import reaction, trained, trials
+from kslc_jax.evaluation.schedules import Schedule
+from kslc_jax.policy import Policy
+
+COLUMNS = (
+    ("survival", "survived", "{:.0%}"),
+    ("seconds_to_fall", "fell at [s]", "{:.0f}"),
+    ("changes", "changes", "{:.1f}"),
+    ("forward_mean", "mean vx [m/s]", "{:.2f}"),
+    ("change_error", "error after a change [m/s]", "{:.2f}"),
+    ("settled", "settled", "{:.0%}"),
+    ("settle_seconds", "after [s]", "{:.1f}"),
+    ("stopped", "stopped", "{:.0%}"),
+    ("stop_seconds", "within [s]", "{:.1f}"),
+    ("stop_metres", "within [m]", "{:.2f}"),
+    ("drift", "drift at rest [m/s]", "{:.3f}"),
+    ("yaw_rate_std", "yaw std", "{:.2f}"),
+)
+"""(name, label, form) of the numbers in the table."""
+
+
+def measure(
+    policy: Policy,
+    setting: trials.Setting,
+    schedules: Sequence[Schedule],
+    robots: int,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda share: None,
+) -> list[dict[str, Any]]:
+    """One row per schedule: numbers of `reaction.summary`, its falls, and a few robots' speeds.
+
+    Args:
+      policy: who is tried.
+      setting: conditions; its schedule is replaced.
+      schedules: what is commanded.
+      robots: trials per schedule.
+      seed: of initial states, robots and drawn commands.
+      progress: told the share that is done.
+    """
+    dt, rows = setting.physics.control_dt, []
+    for i, schedule in enumerate(schedules):
+        tried = replace(setting, schedule=schedule)
+        pieces = []
+        for piece in trials.run(policy, tried, np.zeros((robots, 3)), seed):
+            pieces.append(piece)
+            progress((i + len(pieces) / round(setting.seconds)) / len(schedules))
+        trace = trials.join(pieces)
+        what = {"schedule": schedule.name, "top": schedule.top}
+        how = {"falls": reaction.falls(trace, dt), "series": reaction.series(trace, dt)}
+        numbers = reaction.summary(trace, dt)
+        rows.append(what | numbers | how | trained.beyond(policy, tried))
+    return rows
+
+
+def table(results: dict[str, list[dict[str, Any]]], title: str):
+    """All schedules under all conditions as one rich table; * is beyond the training."""
+    from rich.table import Table
+
+    caption = None
+    if any("beyond" in row for rows in results.values() for row in rows):
+        caption = "* beyond what the policy was trained for, see 'beyond' in the JSON"
+    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    out.add_column("condition")
+    out.add_column("schedule")
+    for _, label, _ in COLUMNS:
+        out.add_column(label, justify="right")
+    for condition, rows in results.items():
+        for row in rows:
+            cells = [form.format(row[name]) if name in row else "-" for name, _, form in COLUMNS]
+            out.add_row(condition, row["schedule"] + "*" * ("beyond" in row), *cells)
+    return out

@@ -1,0 +1,83 @@
+"""Conditions of a trial that lie beyond those a policy was trained for."""
+
+import dataclasses
+from collections.abc import Sequence
+
+from kslc_jax.config import Config, RandomizeConfig
+from kslc_jax.evaluation import variation
+from kslc_jax.evaluation.schedules import Schedule
+from kslc_jax.evaluation.trials import Setting
+from kslc_jax.policy import Policy
+
+TOLERANCE = 1e-6
+"""Numbers this close to the end of a range lie in it."""
+
+RANGES = ("base_mass", "base_com", "kp", "kd", "motor_strength", "joint_friction")
+"""Fields of RandomizeConfig that are compared as they are."""
+
+
+def beyond(
+    policy: Policy, setting: Setting, command: Sequence[float] = (0.0, 0.0, 0.0)
+) -> dict[str, list[str]]:
+    """{"beyond": reasons} where a trial asks for more than the training had; {} where it does not.
+
+    Args:
+      policy: its config and its curriculum say what it was trained for.
+      setting: conditions; with a schedule that says what is commanded.
+      command: vx, vy [m/s], yaw rate [rad/s] of a trial without a schedule.
+    """
+    trained, v_max = policy.config, float(policy.curriculum.v_max)
+    schedule = setting.schedule
+    asked = _commanded(schedule, trained) if schedule else [tuple(command)]
+    reasons = _command_reasons(trained, v_max, asked)
+    if schedule and _pace(schedule) < trained.command.resample_seconds - TOLERANCE:
+        reasons.append("pace")
+    reasons += _robot_reasons(trained.randomize, setting.randomize)
+    if setting.latency > trained.env.action_delay:
+        reasons.append("latency")
+    others = {"imu": any(setting.imu_offset), "punch": setting.punch, "arms": setting.hold_arms}
+    for field in dataclasses.fields(variation.Variation):
+        others[field.name] = getattr(setting.variation, field.name)
+    reasons += [name for name, value in others.items() if value]
+    return {"beyond": reasons} if reasons else {}
+
+
+def _commanded(schedule: Schedule, trained: Config) -> list[tuple[float, float, float]]:
+    if schedule.steps:
+        return [(step.vx, step.vy, step.yaw_rate) for step in schedule.steps]
+    return [(schedule.low, 0.0, 0.0), (schedule.top, 0.0, 0.0)]
+
+
+def _pace(schedule: Schedule) -> float:
+    """Seconds of the shortest leg."""
+    return min((step.seconds for step in schedule.steps), default=schedule.seconds[0])
+
+
+def _command_reasons(trained: Config, v_max: float, asked) -> list[str]:
+    low, (right, left) = trained.curriculum.v_min, trained.command.vy
+    spans = {
+        "speed": (0, low, v_max),
+        "sideways": (1, right, left),
+        "turn": (2, -trained.command.max_yaw_rate, trained.command.max_yaw_rate),
+    }
+    return [
+        name
+        for name, (at, low, high) in spans.items()
+        if any(not low - TOLERANCE <= one[at] <= high + TOLERANCE for one in asked)
+    ]
+
+
+def _robot_reasons(trained: RandomizeConfig, tried: RandomizeConfig) -> list[str]:
+    def contact(config: RandomizeConfig) -> tuple[float, float]:
+        low, high = (0.5 * (mu + config.ground_friction) for mu in config.friction)
+        return low, high
+
+    spans = {name: (getattr(tried, name), getattr(trained, name)) for name in RANGES}
+    spans["friction"] = contact(tried), contact(trained)
+    reasons = [
+        name
+        for name, (mine, theirs) in spans.items()
+        if mine[0] < theirs[0] - TOLERANCE or mine[1] > theirs[1] + TOLERANCE
+    ]
+    pushed = tried.push_seconds > 0 and tried.push_velocity > trained.push_velocity
+    return reasons + ["push"] * pushed

@@ -1,0 +1,230 @@
+"""Does a policy meet the bars? python -m kslc_jax.judge POLICY [--quick] [--json out.json]
+
+Tries the policy in full C MuJoCo at high fidelity: at each commanded speed, under commands that
+change at random from four starting headings, and with each perturbation of sim2sim. Prints one
+table: each bar, what is wanted, the worst that was measured and where. Exits with 0 whether the
+bars are met or not. docs/sim2sim.md says how it measures.
+
+POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
+
+Examples:
+  python -m kslc_jax.judge xbot_l_run --quick
+  python -m kslc_jax.judge runs/laptop-seed0 --json judged.json
+  python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --seconds 60 --drake
+"""
+
+import dataclasses
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from kslc_jax import cli, evaluate, files
+from kslc_jax.config import HighFidelity, require_seed
+from kslc_jax.evaluation import tables
+from kslc_jax.evaluation.bars import Bar, bars
+from kslc_jax.evaluation.perturbations import ALL, changes, settings
+
+SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
+"""Commanded speeds [m/s]; the last one is reported, no bar asks for it."""
+
+HEADINGS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
+"""Starting headings [rad] of the schedule. At pi the measured yaw jumps between pi and -pi."""
+
+SCHEDULE = "random"
+
+DRAKE_SECONDS = 20.0
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is tried: robots per speed or condition, and seconds."""
+
+    speeds: tuple[float, ...]
+    seeds: int
+    seconds: float
+    headings: tuple[float, ...]
+    schedule_robots: int
+    schedule_seconds: float
+    perturbations: tuple[str, ...]
+    perturbed_speeds: tuple[float, ...]
+    perturbed_seeds: int
+    perturbed_seconds: float
+
+
+FULL = Size(SPEEDS, 8, 30.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, 3.0), 8, 20.0)
+QUICK = Size(
+    (0.0, 0.5, 2.0, 3.5, 4.0), 2, 8.0, (0.0, math.pi), 8, 20.0, ("push=0.5",), (3.0,), 2, 8.0
+)
+
+
+@dataclass(frozen=True)
+class Args:
+    """What to judge, and how thoroughly."""
+
+    policy: tyro.conf.Positional[Path]
+    """Run folder, checkpoint folder, or name of a shipped policy."""
+    quick: bool = False
+    """Few speeds, robots and seconds: a first look."""
+    seeds: int | None = None
+    """Trials per speed; None: 8."""
+    seconds: float | None = None
+    """Length of the trials at constant speeds; None: 30."""
+    drake: bool = False
+    """Tries it in Drake, too: slow, and needs the package drake."""
+    seed: int = 0
+    """Of initial states, robots and drawn commands."""
+    json: Path | None = None
+    """Where to keep the numbers; written after each part."""
+
+    def __post_init__(self):
+        require_seed(self.seed)
+        evaluate.check(self.size.speeds, self.size.seeds, self.size.seconds)
+
+    @property
+    def size(self) -> Size:
+        """How much is tried."""
+        asked = {"seeds": self.seeds, "seconds": self.seconds}
+        given = {name: value for name, value in asked.items() if value is not None}
+        return dataclasses.replace(QUICK if self.quick else FULL, **given)
+
+
+Results = dict[str, Any]
+Progress = Callable[[str, float], None]
+
+
+def measure(
+    args: Args, policy, progress: Progress, keep: Callable[[Results], None] = lambda found: None
+) -> Results:
+    """Everything that `bars` reads; `keep` gets what there is after each part."""
+    found: Results = {}
+    for name, part in PARTS.items():
+        if name != "drake" or args.drake:
+            found[name] = part(args, policy, progress)
+            keep(found)
+    return found
+
+
+def _speeds(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
+    from kslc_jax.evaluation import trials
+    from kslc_jax.evaluation.measure import measure as measured
+
+    size = args.size
+    plain = trials.Setting(HighFidelity(), seconds=size.seconds)
+
+    def told(share: float) -> None:
+        progress("speeds", share)
+
+    return measured(policy, plain, size.speeds, size.seeds, args.seed, told)
+
+
+def _schedules(args: Args, policy, progress: Progress) -> dict[str, list[dict[str, Any]]]:
+    from kslc_jax.evaluation import scheduled, schedules, trials
+
+    size, found = args.size, {}
+    schedule = schedules.named(SCHEDULE, policy.config, float(policy.curriculum.v_max))
+    for i, heading in enumerate(size.headings):
+
+        def told(share: float, i: int = i) -> None:
+            progress("schedules", (i + share) / len(size.headings))
+
+        setting = trials.Setting(HighFidelity(), seconds=size.schedule_seconds, heading=heading)
+        found[f"heading={heading:.2f}"] = scheduled.measure(
+            policy, setting, [schedule], size.schedule_robots, args.seed, told
+        )
+    return found
+
+
+def _perturbed(args: Args, policy, progress: Progress) -> dict[str, list[dict[str, float]]]:
+    from kslc_jax.evaluation import gait_metrics, trials
+    from kslc_jax.evaluation.measure import measure as measured
+
+    def speed(trace, command: float, robot, dt: float) -> dict[str, float]:
+        return gait_metrics.speed(trace, command, dt)
+
+    size, found = args.size, {}
+    plain = trials.Setting(HighFidelity(), seconds=size.perturbed_seconds)
+    for i, condition in enumerate(size.perturbations):
+
+        def told(share: float, i: int = i) -> None:
+            progress("perturbed", (i + share) / len(size.perturbations))
+
+        setting = dataclasses.replace(plain, **settings(changes(condition), plain.randomize))
+        found[condition] = measured(
+            policy, setting, size.perturbed_speeds, size.perturbed_seeds, args.seed, told, speed
+        )
+    return found
+
+
+def _drake(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
+    from kslc_jax import sim2sim
+    from kslc_jax.evaluation import trials
+    from kslc_jax.evaluation.measure import measure as measured
+
+    size = args.size
+    setting = trials.Setting(
+        HighFidelity(), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
+    )
+    speeds = [speed for speed in size.speeds if speed <= 4.0]
+    return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
+
+
+PARTS = {"speeds": _speeds, "schedules": _schedules, "perturbed": _perturbed, "drake": _drake}
+"""What is measured, in this order."""
+
+
+def table(found: list[Bar], title: str):
+    """The bars as a rich table."""
+    from rich.table import Table
+
+    out = Table(title=title, title_justify="left")
+    for label in ("bar", "wanted", "worst", "where", "met"):
+        out.add_column(label)
+    for bar in found:
+        out.add_row(bar.name, bar.wanted, bar.shown(), bar.where, "yes" if bar.met else "NO")
+    return out
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return cli.run(lambda: _report(cli.parse("judge", Args, argv, __doc__)))
+
+
+def _report(args: Args) -> None:
+    """Judges the policy, prints the table, keeps the numbers."""
+    from rich.progress import Progress
+
+    from kslc_jax import sim2sim
+    from kslc_jax.policy import load_policy
+
+    files.require_writable(args.json)
+    sim2sim.simulator("drake" if args.drake else "mujoco")
+    policy = load_policy(args.policy)
+    about: Results = {"policy": str(args.policy), "step": policy.step, "quick": args.quick}
+    about |= {"seed": args.seed, "size": dataclasses.asdict(args.size)}
+
+    def keep(found: Results) -> None:
+        if args.json is not None:
+            files.write_json(args.json, about | found)
+
+    screen = tables.console()
+    with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
+        tasks = {name: bar.add_task(name, total=1.0, start=False) for name in PARTS}
+        bar.update(tasks["drake"], visible=args.drake)
+
+        def progress(name: str, share: float) -> None:
+            bar.start_task(tasks[name])
+            bar.update(tasks[name], completed=share)
+
+        found = measure(args, policy, progress, keep)
+    judged = bars(found)
+    keep(found | {"bars": [dataclasses.asdict(one) for one in judged]})
+    screen.print(table(judged, f"{args.policy}, train step {policy.step}"))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

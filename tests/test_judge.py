@@ -1,0 +1,118 @@
+"""The bars: what they read, and the command that measures it."""
+
+import json
+
+import pytest
+
+from kslc_jax import checkpoint, evaluate, judge
+from kslc_jax.evaluation import scheduled
+from kslc_jax.evaluation.bars import bars
+
+
+def row(command, **changes):
+    """A speed that meets every bar."""
+    good = {
+        "survival": 1.0,
+        "forward_mean": command,
+        "lateral_mean": 0.0,
+        "stride_frequency": 1.5 if command else 0.0,
+        "within_speed_limits": 1.0,
+        "shoulder_hip_correlation": -0.9 if command else 0.0,
+        "stance_difference": 0.02,
+        "knee_range_difference": 0.01,
+        "lateral_std": 0.05,
+        "yaw_rate_std": 0.1,
+        "flight_share": 0.3,
+    }
+    return {"command": command} | good | changes
+
+
+def good():
+    """Results that meet every bar."""
+    return {
+        "speeds": [row(0.0), row(0.5), row(3.5), row(4.0), row(4.5, survival=0.0)],
+        "schedules": {"heading=0.00": [{"schedule": "random", "survival": 1.0}]},
+        "perturbed": {"payload=5": [row(1.0), row(3.0)]},
+    }
+
+
+def test_a_good_policy_meets_all_bars():
+    """What happens at 4.5 m/s is no bar."""
+    found = bars(good())
+    assert len(found) == 12 and all(bar.met for bar in found)
+
+
+@pytest.mark.parametrize(
+    ("at", "changes", "name", "value"),
+    [
+        (3, {"survival": 0.5}, "nobody falls, 0 to 4 m/s", 0.5),
+        (1, {"forward_mean": 0.45}, "speed error, 0.5 to 4 m/s, share", 0.1),
+        (0, {"forward_mean": -0.05}, "speed at command 0 [m/s]", 0.05),
+        (0, {"stride_frequency": 1.0}, "strides a second at command 0", 1.0),
+        (2, {"within_speed_limits": 0.9}, "joints within speed limits, to 3.5 m/s", 0.9),
+        (1, {"shoulder_hip_correlation": 0.8}, "arm-leg correlation", 0.8),
+        (1, {"knee_range_difference": 0.2}, "left-right difference", 0.2),
+        (2, {"lateral_std": 0.2}, "lateral std, to 3.5 m/s [m/s]", 0.2),
+        (2, {"yaw_rate_std": 0.3}, "yaw-rate std, to 3.5 m/s [rad/s]", 0.3),
+        (2, {"flight_share": 0.05}, "flight at 3.5 m/s", 0.05),
+    ],
+)
+def test_each_bar_tells_the_worst_and_where(at, changes, name, value):
+    results = good()
+    results["speeds"][at] |= changes
+    (missed,) = [bar for bar in bars(results) if not bar.met]
+    assert missed.name == name and missed.value == pytest.approx(value)
+    assert missed.where == f"{results['speeds'][at]['command']:g} m/s"
+
+
+@pytest.mark.parametrize("part", ["schedules", "perturbed"])
+def test_a_fall_under_any_condition_is_told(part):
+    results = good()
+    condition, rows = next(iter(results[part].items()))
+    rows[-1]["survival"] = 0.75
+    (missed,) = [bar for bar in bars(results) if not bar.met]
+    assert missed.value == 0.75 and missed.where.startswith(condition)
+
+
+def test_drake_is_a_bar_where_it_was_tried():
+    results = good() | {"drake": [row(1.0, survival=0.0)]}
+    (missed,) = [bar for bar in bars(results) if not bar.met]
+    assert missed.name.startswith("nobody falls, Drake")
+
+
+def test_what_was_not_measured_is_not_met():
+    """A policy that falls at once has no gait to measure."""
+    results = good() | {"speeds": [{"command": 0.5, "survival": 0.0, "forward_mean": 0.0}]}
+    found = {bar.name: bar for bar in bars(results)}
+    assert found["arm-leg correlation"].value is None and not found["arm-leg correlation"].met
+    assert found["arm-leg correlation"].shown() == "-"
+
+
+def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, capsys):
+    """One table, JSON, and exit code 0 though a bar is missed."""
+
+    def measure(policy, setting, speeds, seeds, seed, progress, describe=None):
+        progress(1.0)
+        return [row(speed) for speed in speeds]
+
+    def under(policy, setting, plans, robots, seed, progress):
+        progress(1.0)
+        return [{"schedule": plan.name, "survival": 0.5} for plan in plans]
+
+    monkeypatch.setattr(evaluate, "measure", measure)
+    monkeypatch.setattr(scheduled, "measure", under)
+    policy = checkpoint.load_policy("xbot_l_run")
+    monkeypatch.setattr(checkpoint, "load_policy", lambda path: policy)
+    out = tmp_path / "judged.json"
+    assert judge.main(["xbot_l_run", "--json", str(out)]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("yes") == 11 and shown.count("NO") == 1
+    kept = json.loads(out.read_text())
+    assert len(kept["bars"]) == 12 and kept["size"]["seeds"] == judge.FULL.seeds
+    assert len(kept["perturbed"]) == 16 and len(kept["schedules"]) == 4
+
+
+def test_errors_are_one_line(capsys):
+    for argv in (["no-such-policy"], ["xbot_l_run", "--seconds", "2.5"]):
+        assert judge.main(argv) == 2
+        assert capsys.readouterr().err.count("\n") == 1
