@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from kslc_jax import checkpoint, evaluate, judge
+from kslc_jax import judge
 from kslc_jax.evaluation import scheduled
 from kslc_jax.evaluation.bars import bars
 
@@ -99,10 +99,10 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
         progress(1.0)
         return [{"schedule": plan.name, "survival": 0.5} for plan in plans]
 
-    monkeypatch.setattr(evaluate, "measure", measure)
+    monkeypatch.setattr(measuring, "measure", measure)
     monkeypatch.setattr(scheduled, "measure", under)
-    policy = checkpoint.load_policy("xbot_l_run")
-    monkeypatch.setattr(checkpoint, "load_policy", lambda path: policy)
+    policy = policy_lib.load_policy("xbot_l_run")
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: policy)
     out = tmp_path / "judged.json"
     assert judge.main(["xbot_l_run", "--json", str(out)]) == 0
     shown = capsys.readouterr().out

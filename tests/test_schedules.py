@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, trials
+from kslc_jax import curriculum, networks
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
-from kslc_jax.evaluation import reaction, schedules, trained
+from kslc_jax.evaluation import reaction, schedules, trained, trials
+from kslc_jax.policy import Policy
 
 DT = 0.01
 CONFIG = preset("laptop")
@@ -143,7 +144,7 @@ def still():
     """A policy that asks for the default pose whatever it sees."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    return checkpoint.Policy(config, params, curriculum.init(config), 0)
+    return Policy(config, params, curriculum.init(config), 0)
 
 
 def test_a_trial_follows_its_schedule_from_any_heading(still):
@@ -224,7 +225,7 @@ def test_the_leg_of_a_fall_is_no_change(lived, changes):
 
 
 def test_what_lies_beyond_the_training_is_named(still):
-    policy = checkpoint.Policy(CONFIG, None, curriculum.init(CONFIG), 0)
+    policy = Policy(CONFIG, None, curriculum.init(CONFIG), 0)
     v_max = float(policy.curriculum.v_max)
     plain = trials.Setting(HighFidelity())
 

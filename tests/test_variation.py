@@ -9,10 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from kslc_jax import checkpoint, curriculum, networks, physics, randomize, robot, trials
+from kslc_jax import curriculum, networks, physics, randomize, robot
 from kslc_jax.config import ConfigError, HighFidelity, preset
-from kslc_jax.evaluation import disturbances, variation
+from kslc_jax.evaluation import disturbances, trials, variation
 from kslc_jax.evaluation.variation import Variation
+from kslc_jax.policy import Policy
 
 DT = 0.01
 
@@ -166,7 +167,7 @@ def test_a_disturbed_trial_is_of_its_own_robots():
     trial after it is of the described robot again."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    still = checkpoint.Policy(config, params, curriculum.init(config), 0)
+    still = Policy(config, params, curriculum.init(config), 0)
     plain = trials.Setting(HighFidelity(), seconds=1.0)
 
     def run(setting):
