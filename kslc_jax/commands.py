@@ -25,7 +25,7 @@ def sample(
     key: jax.Array,
     vx_range: tuple[jax.Array, jax.Array],
     yaw: jax.Array,
-    top_width: float = 0.0,
+    top_width: float,
 ) -> Command:
     """Draws a command for a robot that now heads to `yaw` [rad].
 

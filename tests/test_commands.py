@@ -20,12 +20,12 @@ KEY = jax.random.key(0)
 def draw(vx=0.0, vy=0.0, heading=0.0, yaw=0.0, **changes):
     """The command drawn from ranges that hold one value."""
     config = dataclasses.replace(PAPER, vy=(vy, vy), heading=(heading, heading), **changes)
-    return commands.sample(config, KEY, (jnp.asarray(vx), jnp.asarray(vx)), jnp.asarray(yaw))
+    return commands.sample(config, KEY, (jnp.asarray(vx), jnp.asarray(vx)), jnp.asarray(yaw), 0.5)
 
 
 def draw_many(config: CommandConfig, n=4000, vx=(-0.3, 3.5), yaw=0.0):
     bounds = jnp.asarray(vx[0]), jnp.asarray(vx[1])
-    sample = jax.vmap(lambda key: commands.sample(config, key, bounds, jnp.asarray(yaw)))
+    sample = jax.vmap(lambda key: commands.sample(config, key, bounds, jnp.asarray(yaw), 0.5))
     return sample(jax.random.split(KEY, n))
 
 

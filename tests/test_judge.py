@@ -5,6 +5,8 @@ import json
 import pytest
 
 from kslc_jax import judge
+from kslc_jax import policy as policy_lib
+from kslc_jax.evaluation import measure as measuring
 from kslc_jax.evaluation import scheduled
 from kslc_jax.evaluation.bars import bars
 

@@ -66,6 +66,7 @@ class Schedule:
     name: str
     top: float  # m/s, the fastest command
     low: float = 0.0  # m/s, the slowest one
+    top_width: float = 0.0  # m/s, of the range from which training draws its top commands
     steps: tuple[Step, ...] = ()  # the list; empty if the commands are drawn
     seconds: tuple[float, float] = (PATIENCE, PATIENCE)  # shortest and longest drawn leg
     brakes: bool = False  # some of the drawn legs run at the top speed, then stop or reverse
@@ -99,7 +100,7 @@ def named(name: str, config: Config, v_max: float, top: float | None = None) -> 
       ConfigError: no such name, or no such file, or a file that is no schedule.
     """
     fastest, low = (v_max if top is None else top), config.curriculum.v_min
-    blank = Schedule(name, top=fastest, low=low)
+    blank = Schedule(name, top=fastest, low=low, top_width=config.curriculum.v_step)
     match name:
         case "stop":
             steps = Step(RUN, fastest), Step(REST, 0.0)
@@ -243,7 +244,7 @@ def _drawn(schedule: Schedule, config: CommandConfig, leg: Leg, key, yaw: jax.Ar
     low, top = jnp.asarray(schedule.low), jnp.asarray(schedule.top)
     place = leg.number % BLOCK
     fast, brakes = (schedule.brakes & (place == BLOCK - back) for back in (2, 1))
-    sampled = commands.sample(config, keys[0], (low, top), yaw)
+    sampled = commands.sample(config, keys[0], (low, top), yaw, schedule.top_width)
     reverses = jax.random.bernoulli(keys[1], REVERSALS)
     straight = jnp.where(fast, top, jnp.where(reverses, low, 0.0)) * jnp.array([1.0, 0.0, 0.0])
     drawn = sampled.velocity.at[2].set(0.0)  # the heading says where to turn
