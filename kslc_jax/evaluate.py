@@ -165,7 +165,8 @@ def console():
     """A rich console as wide as the terminal, or where there is none as wide as the table."""
     from rich.console import Console
 
-    return Console(highlight=False, width=None if sys.stdout.isatty() else 180)
+    # Without markup: it would take the unit [m/s] for a style.
+    return Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else 180)
 
 
 def main(argv: list[str] | None = None) -> int:
