@@ -147,14 +147,14 @@ def sweep(args: Args, policy, progress=lambda share: None) -> list[dict[str, flo
 
 def table(rows: list[dict[str, float]], title: str, columns=HEADLINE):
     """The numbers of those columns as a rich table."""
+    from rich.markup import escape
     from rich.table import Table
 
     marked = any("beyond" in row for row in rows)
     caption = "* beyond what the policy was trained for" if marked else None
     out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    out.add_column("command [m/s]", justify="right")
-    for _, label, _ in columns:
-        out.add_column(label, justify="right")
+    for label in ("command [m/s]", *(label for _, label, _ in columns)):
+        out.add_column(escape(label), justify="right")  # rich would take [m/s] for a style
     for row in rows:
         cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
         out.add_row(f"{row['command']:.1f}" + "*" * ("beyond" in row), *cells)
@@ -165,8 +165,7 @@ def console():
     """A rich console as wide as the terminal, or where there is none as wide as the table."""
     from rich.console import Console
 
-    # Without markup: it would take the unit [m/s] for a style.
-    return Console(highlight=False, markup=False, width=None if sys.stdout.isatty() else 180)
+    return Console(highlight=False, width=None if sys.stdout.isatty() else 180)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -177,13 +177,16 @@ PARTS = {"speeds": _speeds, "schedules": _schedules, "perturbed": _perturbed, "d
 
 def table(found: list[Bar], title: str):
     """The bars as a rich table."""
+    from rich.markup import escape
     from rich.table import Table
 
     out = Table(title=title, title_justify="left")
     for label in ("bar", "wanted", "worst", "where", "met"):
         out.add_column(label)
     for bar in found:
-        out.add_row(bar.name, bar.wanted, bar.shown(), bar.where, "yes" if bar.met else "NO")
+        out.add_row(
+            escape(bar.name), bar.wanted, bar.shown(), bar.where, "yes" if bar.met else "NO"
+        )
     return out
 
 
