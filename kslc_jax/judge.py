@@ -10,7 +10,7 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 Examples:
   python -m kslc_jax.judge xbot_l_run --quick
   python -m kslc_jax.judge runs/laptop-seed0 --json judged.json
-  python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --seconds 60 --drake
+  python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --drake
 """
 
 import dataclasses
@@ -56,9 +56,9 @@ class Size:
     perturbed_seconds: float
 
 
-FULL = Size(SPEEDS, 8, 30.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, 3.0), 8, 20.0)
+FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, 3.0), 4, 20.0)
 QUICK = Size(
-    (0.0, 0.5, 2.0, 3.5, 4.0), 2, 8.0, (0.0, math.pi), 8, 20.0, ("push=0.5",), (3.0,), 2, 8.0
+    (0.0, 0.5, 2.0, 3.5, 4.0), 2, 15.0, (0.0, math.pi), 8, 20.0, ("push=0.5",), (3.0,), 2, 8.0
 )
 
 
@@ -71,9 +71,9 @@ class Args:
     quick: bool = False
     """Few speeds, robots and seconds: a first look."""
     seeds: int | None = None
-    """Trials per speed; None: 8."""
+    """Trials per speed; None: 4."""
     seconds: float | None = None
-    """Length of the trials at constant speeds; None: 30."""
+    """Length of the trials at constant speeds; None: 60."""
     drake: bool = False
     """Tries it in Drake, too: slow, and needs the package drake."""
     seed: int = 0
@@ -179,13 +179,16 @@ PARTS = {"speeds": _speeds, "schedules": _schedules, "perturbed": _perturbed, "d
 
 def table(found: list[Bar], title: str):
     """The bars as a rich table."""
+    from rich.markup import escape
     from rich.table import Table
 
     out = Table(title=title, title_justify="left")
     for label in ("bar", "wanted", "worst", "where", "met"):
         out.add_column(label)
     for bar in found:
-        out.add_row(bar.name, bar.wanted, bar.shown(), bar.where, "yes" if bar.met else "NO")
+        out.add_row(
+            escape(bar.name), bar.wanted, bar.shown(), bar.where, "yes" if bar.met else "NO"
+        )
     return out
 
 

@@ -108,6 +108,7 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
     out = tmp_path / "judged.json"
     assert judge.main(["xbot_l_run", "--json", str(out)]) == 0
     shown = capsys.readouterr().out
+    assert "speed at command 0 [m/s]" in shown  # rich takes it for a style unless told
     assert shown.count("yes") == 11 and shown.count("NO") == 1
     kept = json.loads(out.read_text())
     assert len(kept["bars"]) == 12 and kept["size"]["seeds"] == judge.FULL.seeds

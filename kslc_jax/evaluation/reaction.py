@@ -130,13 +130,12 @@ def _changes(trace: Trace, robot: int, dt: float) -> list[Change]:
     velocity = np.asarray(trace.linvel)[:end, robot, :2]
     command = np.asarray(trace.command)[:end, robot, :2]
     position = np.asarray(trace.qpos)[:end, robot, :2]
-    starts = np.flatnonzero(np.diff(leg)) + 1
-    ends = [*starts, end]  # the first leg ends where the second one starts
+    marks = [*(np.flatnonzero(np.diff(leg)) + 1), end]  # starts of the legs, and the end
     if fell:
-        ends = ends[:-1]
+        marks = marks[:-1]
     return [
         _change(velocity[a:b], command[a - 1 : b], position[a:b], dt)
-        for a, b in itertools.pairwise(ends)
+        for a, b in itertools.pairwise(marks)
     ]
 
 

@@ -62,6 +62,7 @@ def measure(
 
 def table(results: dict[str, list[dict[str, Any]]], title: str):
     """All schedules under all conditions as one rich table; * is beyond the training."""
+    from rich.markup import escape
     from rich.table import Table
 
     caption = None
@@ -71,7 +72,7 @@ def table(results: dict[str, list[dict[str, Any]]], title: str):
     out.add_column("condition")
     out.add_column("schedule")
     for _, label, _ in COLUMNS:
-        out.add_column(label, justify="right")
+        out.add_column(escape(label), justify="right")  # rich would take [m/s] for a style
     for condition, rows in results.items():
         for row in rows:
             cells = [form.format(row[name]) if name in row else "-" for name, _, form in COLUMNS]

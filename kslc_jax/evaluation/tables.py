@@ -4,6 +4,7 @@ import sys
 from collections.abc import Sequence
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 Row = dict[str, float]
@@ -44,9 +45,8 @@ def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table
     marked = any("beyond" in row for row in rows)
     caption = "* beyond what the policy was trained for" if marked else None
     out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    out.add_column("command [m/s]", justify="right")
-    for _, label, _ in columns:
-        out.add_column(label, justify="right")
+    for label in ("command [m/s]", *(label for _, label, _ in columns)):
+        out.add_column(escape(label), justify="right")  # rich would take [m/s] for a style
     for row in rows:
         cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
         out.add_row(f"{row['command']:.1f}" + "*" * ("beyond" in row), *cells)

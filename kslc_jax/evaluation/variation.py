@@ -140,6 +140,8 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
     model = robot.mj_model
     names = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
     out = {name: getattr(model, name).copy() for name in names}
+    if kg == 0:
+        return out
     for i, side in zip(_hand_bodies(robot), ("left", "right"), strict=True):
         mass, centre = out["body_mass"][i], out["body_ipos"][i]
         arm = model.geom(f"{side}_hand").pos - centre
