@@ -8,16 +8,16 @@ from kslc_jax import maths
 from kslc_jax.config import CommandConfig
 
 TURNING = 0.1
-"""Commanded yaw rate [rad/s] below which a robot with zero velocity command may stand still."""
+"""Commanded yaw rate [rad/s] above which a robot with a zero velocity command must step."""
 
 
 @flax.struct.dataclass
 class Command:
-    """What the robot is asked to do."""
+    """Commanded velocity and heading of one robot."""
 
     velocity: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s], base frame
     heading: jax.Array  # [] rad, world
-    moving: jax.Array  # [] bool: False asks to stand still (clock stopped, both feet down)
+    moving: jax.Array  # [] bool, False: stand still (clock off, both feet down)
 
 
 def sample(
@@ -27,11 +27,12 @@ def sample(
     yaw: jax.Array,
     top_width: float,
 ) -> Command:
-    """Draws a command for a robot that now heads to `yaw` [rad].
+    """Draws a command for a robot whose present heading is `yaw` [rad].
 
-    vx is uniform in `vx_range` [m/s]; for the `slow_fraction` in its part up to `slow_speed`, for
-    the `top_fraction` in its uppermost `top_width`. Fast commands come with small side steps and
-    turns: with `narrow_speed` both shrink linearly.
+    vx is uniform in `vx_range` [m/s]. A share `slow_fraction` of the commands uses only the part up
+    to `slow_speed`, and a share `top_fraction` only the uppermost `top_width` [m/s]. With
+    `narrow_speed`, vy and the change of heading shrink linearly with |vx|. A share `stand_fraction`
+    has zero velocity and keeps its heading. A share `forward_fraction` goes straight ahead.
     """
     keys = jax.random.split(key, 5)
     low, high = vx_range
@@ -60,7 +61,7 @@ def sample(
 
 
 def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> jax.Array:
-    """Control steps [] that a new command holds for."""
+    """Number of control steps [] for which a new command holds."""
     longest = round(config.resample_seconds / control_dt)
     if config.shortest_seconds == 0:
         return jnp.asarray(longest)
@@ -69,15 +70,18 @@ def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> j
 
 
 def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:
-    """Recomputes the commanded yaw rate from the heading error, every step (HG)."""
+    """Recomputes the commanded yaw rate from the heading error; called at every step (HG)."""
     error = maths.wrap_angle(command.heading - yaw)
     rate = jnp.clip(config.heading_gain * error, -config.max_yaw_rate, config.max_yaw_rate)
     return with_velocity(config, command, command.velocity.at[2].set(rate))
 
 
 def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) -> Command:
-    """The command with `velocity` [3], vx and vy zero within the dead zone; decides whether that
-    means standing still."""
+    """Returns the command with `velocity` [3] in place of its own.
+
+    vx and vy become zero in the dead zone. With `config.stand_still`, such a command means "stand"
+    (`moving` is False) unless it turns faster than `TURNING`.
+    """
     walks = jnp.hypot(velocity[0], velocity[1]) > config.dead_zone
     velocity = velocity * jnp.stack([walks, walks, jnp.ones((), bool)])
     if not config.stand_still:
@@ -87,5 +91,5 @@ def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) 
 
 
 def speed_share(command: Command, v_max: jax.Array) -> jax.Array:
-    """The paper's g = v_cmd / v_max (Eq. 6), of the forward speed, in [0, 1]."""
+    """g = |vx| / v_max in [0, 1], for the commanded vx (paper, Eq. 6)."""
     return jnp.clip(jnp.abs(command.velocity[0]) / v_max, 0.0, 1.0)

@@ -1,4 +1,7 @@
-"""Curriculum of commanded speed (paper, Eq. 9) and gait cycle (Eq. 10): part of the train state."""
+"""Curriculum of commanded speed (paper, Eq. 9) and gait cycle (Eq. 10).
+
+Its state is part of the train state. Commands "at the top" are those of `is_top`.
+"""
 
 import flax.struct
 import jax
@@ -10,40 +13,43 @@ from kslc_jax.config import Config, CurriculumConfig
 
 @flax.struct.dataclass
 class Curriculum:
-    """Ranges in force and the moving averages that gate them."""
+    """Present ranges, and the averages that decide when they change.
+
+    A fading sum is multiplied by `smoothing` before each update's part is added.
+    """
 
     v_max: jax.Array  # [] m/s, upper end of the commanded vx
     cycle_time: jax.Array  # [] s
-    tracking: jax.Array  # [] moving average of the tracking reward over its maximum
-    fast_tracking: jax.Array  # [] the same over the commands in the top part of the range
-    episode_steps: jax.Array  # [] moving average length of finished episodes
-    gait: jax.Array  # [] moving average of how well feet follow the clock at speed, -0.3 to 1
-    top_deviation: jax.Array  # [] m/s, fading sum of vx - commanded vx, settled commands at the top
-    top_scale: jax.Array  # [] m/s, the same of the commanded vx, or of `top_error_floor` if more
-    top_falls: jax.Array  # [] fading sum of the falls under commands at the top
-    top_minutes: jax.Array  # [] the same of the time that robots had such commands
+    tracking: jax.Array  # [] moving average of tracking / its maximum, settled commands
+    fast_tracking: jax.Array  # [] the same, fast commands only (`Outcome.fast`)
+    episode_steps: jax.Array  # [] moving average of the length of finished episodes
+    gait: jax.Array  # [] moving average of feet_contact_number, fast commands, -0.3 to 1
+    top_deviation: jax.Array  # [] m/s, fading sum of vx - commanded vx, settled at the top
+    top_scale: jax.Array  # [] m/s, fading sum of max(commanded vx, `top_error_floor`), same
+    top_falls: jax.Array  # [] fading sum of falls under commands at the top
+    top_minutes: jax.Array  # [] fading sum of minutes under commands at the top
     updates: jax.Array  # [] int, updates since the last change
 
 
 @flax.struct.dataclass
 class Progress:
-    """What one rollout says about the policy; shares are of the maximal tracking reward."""
+    """Statistics of one rollout. Tracking is the tracking reward over its maximum."""
 
-    tracking: jax.Array  # [] mean over the samples whose command has settled
-    tracking_count: jax.Array  # [] number of those
-    fast_tracking: jax.Array  # [] mean over the fast commands' samples
-    fast_count: jax.Array  # [] number of those samples
+    tracking: jax.Array  # [] mean over the samples with a settled command
+    tracking_count: jax.Array  # [] number of these samples
+    fast_tracking: jax.Array  # [] mean over the samples with a fast command
+    fast_count: jax.Array  # [] number of these samples
     episode_steps: jax.Array  # [] mean length of the episodes that ended; see train_step.init
-    episode_count: jax.Array  # [] number of those
-    gait: jax.Array  # [] mean of the feet_contact_number term over the fast commands' samples
-    top_deviation: jax.Array  # [] m/s, sum of vx - commanded vx, settled commands at the top
-    top_scale: jax.Array  # [] m/s, sum of their commanded vx, or of `top_error_floor` if more
+    episode_count: jax.Array  # [] number of these episodes
+    gait: jax.Array  # [] mean of feet_contact_number over the samples with a fast command
+    top_deviation: jax.Array  # [] m/s, sum of vx - commanded vx, settled at the top
+    top_scale: jax.Array  # [] m/s, sum of max(commanded vx, `top_error_floor`), same samples
     top_falls: jax.Array  # [] falls under commands at the top
-    top_minutes: jax.Array  # [] minutes that robots had such commands, all robots together
+    top_minutes: jax.Array  # [] minutes under commands at the top, sum over the robots
 
 
 def init(config: Config) -> Curriculum:
-    """The curriculum's start."""
+    """Curriculum before the first update."""
     return Curriculum(
         v_max=jnp.asarray(config.curriculum.v_start, jnp.float32),
         cycle_time=jnp.asarray(config.gait.cycle_time, jnp.float32),
@@ -60,8 +66,10 @@ def init(config: Config) -> Curriculum:
 
 
 def inherit(config: Config, other: Curriculum) -> Curriculum:
-    """How far another training's curriculum had got, within the limits of this one's; what is left
-    out here (an ablation) stays at its start."""
+    """Copies another run's progress, clipped to this config's limits.
+
+    Disabled parts (`velocity` or `cycle` False) keep their start values.
+    """
     own, limits = init(config), config.curriculum
     v_max = jnp.minimum(other.v_max, limits.v_limit) if limits.velocity else own.v_max
     cycle = jnp.maximum(other.cycle_time, limits.cycle_min) if limits.cycle else own.cycle_time
@@ -69,40 +77,41 @@ def inherit(config: Config, other: Curriculum) -> Curriculum:
 
 
 def is_fast(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.Array:
-    """Whether the commanded vx [m/s] is in the top part of the range."""
+    """True if the commanded vx [m/s] is above `fast_share` of v_max."""
     return vx > config.fast_share * state.v_max
 
 
 def is_top(config: CurriculumConfig, state: Curriculum, vx: jax.Array) -> jax.Array:
-    """True where the commanded vx [m/s] lies within one `v_step` of the range's end."""
+    """True if the commanded vx [m/s] is less than one `v_step` below v_max."""
     return vx > state.v_max - config.v_step
 
 
 def top_error(state: Curriculum) -> jax.Array:
-    """Relative error [] of the mean speed under commands at the top of the range; 1 before any."""
+    """Relative error [] of the mean speed under commands at the top; 1 if there were none."""
     known = state.top_scale > 0.0
     error = jnp.abs(state.top_deviation) / jnp.where(known, state.top_scale, 1.0)
     return jnp.where(known, error, 1.0)
 
 
 def top_falls(state: Curriculum) -> jax.Array:
-    """Falls per minute [] under commands at the top of the range."""
+    """Falls per minute [] under commands at the top."""
     return state.top_falls / jnp.maximum(state.top_minutes, 1e-6)
 
 
 def remaining_share(config: CurriculumConfig, state: Curriculum) -> jax.Array:
-    """Share [] of the way from `v_start` to `v_limit` that is still ahead; 1 if there is none."""
+    """Remaining share [] of the way from `v_start` to `v_limit`; 1 if both are equal."""
     way = config.v_limit - config.v_start
     return (config.v_limit - state.v_max) / way if way > 0.0 else jnp.ones(())
 
 
 def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> Curriculum:
-    """Averages `progress` in and, where the gate opens, widens the range and shortens the cycle.
+    """Adds `progress` to the averages. If the gate opens, widens the range and shortens the cycle.
 
-    The gate asks for enough of each: tracking under all and under fast commands, length of the
-    episodes, feet that follow the clock, updates since the last change; and for a mean speed and
-    few falls under the commands at the top of the range, which a mean over all commands hides.
-    A widened range starts with empty averages of the fast commands.
+    The gate opens if all of these are good enough: tracking under all and under fast commands, the
+    length of episodes, agreement of the feet with the clock, and, under commands at the top, the
+    mean speed and the number of falls. A mean over all commands would hide the last two. At least
+    `min_updates` updates lie between two changes. After a change the averages of fast commands and
+    the sums at the top start at zero again.
     """
     state = _averaged(config, state, progress)
     v_max = jnp.minimum(state.v_max + config.v_step, config.v_limit)
@@ -135,7 +144,7 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
 
 
 def _averaged(config: CurriculumConfig, state: Curriculum, progress: Progress) -> Curriculum:
-    """The curriculum one update later, with the moving averages and fading sums of `progress`."""
+    """Adds `progress` to the moving averages and fading sums, and counts the update."""
 
     def average(old: jax.Array, new: jax.Array, count: jax.Array) -> jax.Array:
         mixed = config.smoothing * old + (1.0 - config.smoothing) * new

@@ -1,7 +1,7 @@
-"""The environment: `reset` and `step` for ONE robot, pure functions; the caller vmaps and jits.
+"""The environment: pure functions `reset` and `step` for ONE robot. The caller vmaps and jits.
 
-`step` is the one place that says in which order things happen in a control step. A reset draws
-every field anew: nothing of an episode reaches the next one.
+Only `step` defines the order of operations in a control step. `reset` sets every field, so nothing
+passes from one episode to the next.
 """
 
 from collections.abc import Callable
@@ -21,48 +21,48 @@ from kslc_jax.randomize import Dynamics
 from kslc_jax.signals import Signals
 
 DIVERGED = 1e3
-"""Speed [m/s, rad/s] above which, or non-finite, the physics counts as broken."""
+"""Physics with a speed [m/s, rad/s] of this size, or with non-finite numbers, has diverged."""
 
 
 @flax.struct.dataclass
 class EnvState:
-    """Everything one environment remembers."""
+    """Whole state of one environment."""
 
     physics: PhysicsState
     dynamics: Dynamics
     gait: GaitState
     command: Command
     command_since: jax.Array  # [] int, `time` when the command was drawn
-    command_until: jax.Array  # [] int, `time` when the next one will be
+    command_until: jax.Array  # [] int, `time` when the next one is drawn
     history: jax.Array  # [K, 59] actor frames, oldest first
-    privileged_history: jax.Array  # [Kp, 89] critic frames
+    privileged_history: jax.Array  # [Kp, 89] critic frames, oldest first
     last_action: jax.Array  # [16] as applied
     last_last_action: jax.Array  # [16]
     last_base_velocity: jax.Array  # [6] world
-    push: jax.Array  # [5] the last push: m/s (x, y), rad/s (3)
+    push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
     time: jax.Array  # [] int, control steps since the reset
 
 
 @flax.struct.dataclass
 class Outcome:
-    """What one step gives beside the next state. Never both `terminated` and `truncated`."""
+    """Result of one step. `terminated` and `truncated` never hold both."""
 
     reward: jax.Array  # []
-    terminated: jax.Array  # [] bool: fell, or the physics broke
-    truncated: jax.Array  # [] bool: time limit
-    broken: jax.Array  # [] bool: the physics diverged; its sample is not to be learnt from
-    terms: dict[str, jax.Array]  # raw reward terms, see rewards.TERMS
-    settled: jax.Array  # [] bool: the command has been the same for a while
-    fast: jax.Array  # [] bool: and it was in the top part of the range
-    top: jax.Array  # [] bool: the command lies within one `v_step` of the range's end
+    terminated: jax.Array  # [] bool, the robot fell, or the physics diverged
+    truncated: jax.Array  # [] bool, the episode reached its time limit
+    broken: jax.Array  # [] bool, the physics diverged; PPO ignores this sample
+    terms: dict[str, jax.Array]  # unweighted reward terms, see rewards.TERMS
+    settled: jax.Array  # [] bool, the command is unchanged for `settle_seconds` or longer
+    fast: jax.Array  # [] bool, settled and in the top part of the range, see is_fast
+    top: jax.Array  # [] bool, the command is less than one `v_step` below v_max
     commanded: jax.Array  # [] m/s, commanded vx
     speed: jax.Array  # [] m/s, vx of the base, base frame
-    episode_steps: jax.Array  # [] int, length of the episode so far; see train_step.init
-    speeding: jax.Array  # [] bool: some joint is at its speed limit, or over it
+    episode_steps: jax.Array  # [] int, age of the episode, see train_step.init
+    speeding: jax.Array  # [] bool, a joint is at or above its speed limit
 
 
 def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
-    """A fresh episode."""
+    """Starts a new episode of one environment."""
     keys = jax.random.split(key, 6)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
@@ -97,18 +97,19 @@ def step(
     curriculum: Curriculum,
     simulate: Callable[..., PhysicsState] = physics.step,
 ) -> tuple[EnvState, Outcome]:
-    """Advances one environment by one control step; starts a new episode where one ended.
+    """Advances one environment by one control step, and resets it if its episode ends.
 
     Args:
       config: static.
       state: the environment before the step.
       action: [16] in joint order, unscaled.
-      key: used for everything random in this step.
-      curriculum: command range and gait cycle in force.
+      key: source of all randomness in this step.
+      curriculum: present command range and gait cycle.
       simulate: the engine, with the signature of `physics.step`.
 
     Returns:
-      The state to act from next (already reset if the episode ended), and the step's outcome.
+      (state for the next action, outcome of this step). The state is already reset if the episode
+      ended.
     """
     keys = jax.random.split(key, 5)
     robot = physics.robot_for(config.physics)
@@ -155,8 +156,11 @@ def _outcome(
     broken: jax.Array,
     curriculum: Curriculum,
 ) -> Outcome:
-    """Whether the episode ended with the step that led from `before` to `now`, and what the step
-    was worth under the `command` that the policy saw, with its yaw rate as it is now (HG)."""
+    """Reward, end of episode and statistics of the step from `before` to `now`.
+
+    `command` is the command that the policy saw, with its yaw rate recomputed for the new heading
+    (HG).
+    """
     robot = physics.robot_for(config.physics)
     time = before.time + 1
     terminated = now.torso_contact | broken
@@ -199,8 +203,10 @@ def _outcome(
 def _applied_action(
     config: Config, action: jax.Array, last_action: jax.Array, noise: jax.Array, key: jax.Array
 ) -> jax.Array:
-    """Clipped action after a random delay and multiplicative noise (HG), both scaled by the
-    episode's `noise` []; arms zeroed if held."""
+    """Clips the action, then applies a random delay and multiplicative noise (HG).
+
+    The episode's factor `noise` [] scales both. Held arms get zero.
+    """
     key_delay, key_noise = jax.random.split(key)
     action = jnp.clip(action, -config.env.action_clip, config.env.action_clip)
     delay = noise * config.env.action_delay * jax.random.uniform(key_delay)
@@ -215,6 +221,7 @@ def _applied_action(
 def _sample_command(
     config: Config, key: jax.Array, curriculum: Curriculum, now: Signals
 ) -> Command:
+    """Draws a command from the curriculum's present range."""
     vx_range = (jnp.asarray(config.curriculum.v_min), curriculum.v_max)
     top_width = config.curriculum.v_step
     return commands.sample(config.command, key, vx_range, now.base_euler[2], top_width)
@@ -223,7 +230,7 @@ def _sample_command(
 def _resample(
     config: Config, state: EnvState, key: jax.Array, curriculum: Curriculum, now: Signals
 ) -> EnvState:
-    """Draws a new command where the old one's time is over."""
+    """Draws a new command if the time of the old one is over."""
     key_command, key_time = jax.random.split(key)
     fresh = state.replace(
         command=_sample_command(config, key_command, curriculum, now),
@@ -235,7 +242,10 @@ def _resample(
 
 
 def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:
-    """Every `push_seconds`: a random change of the base's planar velocity and rotation rate."""
+    """Pushes the base every `push_seconds`.
+
+    A push changes the planar velocity [m/s, world] and the angular velocity [rad/s, body frame].
+    """
     r = config.randomize
     if r.push_seconds <= 0:
         return state
@@ -252,7 +262,7 @@ def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:
 
 
 def _observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> EnvState:
-    """Appends the frames of the present to the histories."""
+    """Appends the present actor and critic frames to the histories."""
     robot = physics.robot_for(config.physics)
     src = observations.Sources(
         signals=now,

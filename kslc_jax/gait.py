@@ -11,12 +11,12 @@ from kslc_jax.robot import Robot
 from kslc_jax.signals import Signals
 
 SOLE_DROP = 0.05
-"""Height of the ankle-roll link above the sole that Humanoid-Gym subtracts [m]."""
+"""Height of the ankle-roll link above the sole [m] (Humanoid-Gym)."""
 
-# Reference motion per joint of the left side: share of the leg amplitude in swing (HG), of the arm
-# swing, of the elbow bend. Signs follow the joint axes: a negative left leg_pitch and knee swing
-# that leg forward and bend it; a positive left shoulder_pitch swings that arm back. The right side
-# has mirrored axes.
+# Reference motion of the left side: each joint's share of an amplitude. LEG is the swing of a leg
+# (HG), _HIP the stride sweep, _ARM the arm swing, _ELBOW the elbow bend. On the left, a negative
+# leg_pitch moves the leg forward, a negative knee bends it, and a positive shoulder_pitch moves the
+# arm back. The joint axes of the right side are mirrored: signs are opposite there.
 LEG = {"leg_pitch": 1.0, "knee": 2.0, "ankle_pitch": 1.0}
 _HIP = {"leg_pitch": 1.0}
 _ARM = {"shoulder_pitch": 1.0}
@@ -25,22 +25,25 @@ _ELBOW = {"elbow_pitch": 1.0}
 
 @flax.struct.dataclass
 class GaitState:
-    """Memory of the gait. Feet: left, right."""
+    """State of the gait from step to step. Feet: left, right."""
 
     phase: jax.Array  # [] share of the gait cycle, in [0, 1)
-    contact: jax.Array  # [2] bool, foot contact of the last step
-    lift_z: jax.Array  # [2] m, height of the foot at its last contact
-    air_time: jax.Array  # [2] s since the last contact, 0 in contact
-    landing: jax.Array  # [2] s, air time that ended this step, else 0
+    contact: jax.Array  # [2] bool, foot contact at the newest step
+    lift_z: jax.Array  # [2] m, height of the ankle-roll link at the last contact
+    air_time: jax.Array  # [2] s in the air, 0 if grounded (see `update`)
+    landing: jax.Array  # [2] s, air time that ended at this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
-    mean_velocity: jax.Array  # [2] m/s, base frame, averaged over about one cycle
-    stance: jax.Array  # [2] bool, where the clock wants the feet down
+    mean_velocity: jax.Array  # [2] m/s, vx, vy, base frame, mean over about one cycle
+    stance: jax.Array  # [2] bool, True: the clock wants this foot on the ground
     clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
 
 
 def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array) -> GaitState:
-    """Gait memory at the start of an episode; `foot_z` [2, m] is where the feet are: heights count
-    from there until they have touched the ground."""
+    """Gait state at the start of an episode.
+
+    `foot_z` [2, m] is the present height of the feet. Swing heights are measured from there until
+    the first contact.
+    """
     phase = jax.random.uniform(key) if config.random_phase else jnp.zeros(())
     clock, stance = _clock(config, phase, command)
     zeros = jnp.zeros(2)
@@ -65,10 +68,10 @@ def update(
     cycle_time: jax.Array,
     dt: float,
 ) -> GaitState:
-    """Advances the clock by `dt` [s] and books contacts.
+    """Advances the clock by `dt` [s] and updates contacts, air times and heights.
 
-    A foot has landed when it, the clock or the step before says 'contact' (HG), and is paid for the
-    air time up to now.
+    A foot is grounded if it has contact, had contact at the step before, or should have it by the
+    clock (HG). When a foot becomes grounded, `landing` is its air time.
     """
     phase = jnp.mod(state.phase + dt / cycle_time, 1.0)
     clock, stance = _clock(config, phase, command)
@@ -104,14 +107,17 @@ def _clock(config: GaitConfig, phase: jax.Array, command: Command) -> tuple[jax.
 
 
 def _share_of_full_speed(config: GaitConfig, command: Command) -> jax.Array:
+    """Commanded |vx| as a share [] of `full_speed`, in [0, 1]."""
     return jnp.clip(jnp.abs(command.velocity[0]) / config.full_speed, 0.0, 1.0)
 
 
 def cycle_time(config: Config, command: Command, curriculum_cycle, v_max) -> jax.Array:
-    """Seconds per cycle [] for this command under the curriculum's cycle time [s] and v_max [m/s].
+    """Seconds per gait cycle [] for this command.
 
-    With `cycle_from_speed` it is what the curriculum's cycle was (Eq. 10) when the command's speed
-    was the top of the range. No command's clock changes then when the range grows.
+    `curriculum_cycle` [s] and `v_max` [m/s] are the curriculum's present values. By default every
+    command uses `curriculum_cycle`. With `cycle_from_speed` the cycle depends on the commanded
+    speed: it is the curriculum's cycle (Eq. 10) of the time when v_max was equal to that speed. The
+    cycle of a command then stays the same while the range grows.
     """
     gait = config.gait
     if gait.cycle_from_speed > 0:
@@ -127,11 +133,11 @@ def cycle_time(config: Config, command: Command, curriculum_cycle, v_max) -> jax
 def reference_pose(
     config: GaitConfig, robot: Robot, state: GaitState, command: Command
 ) -> jax.Array:
-    """Reference joint angles [16, rad] of Humanoid-Gym, with amplitudes that grow with the speed.
+    """Reference joint angles [16, rad]: Humanoid-Gym's, with optional parts that grow with speed.
 
-    The swing leg follows a half sine; with `stride_sweep` the hips and with `arm_swing` the arms
-    follow the cosine, against each other on each side, and with `elbow_bend` the elbows flex. All
-    zero at their Humanoid-Gym settings but the half sine.
+    The swing leg follows a half sine (HG). With `stride_sweep` the hips follow the cosine. With
+    `arm_swing` the arms follow it in the opposite direction of the leg on the same side. With
+    `elbow_bend` the elbows flex. The last three parts are zero by default, as in HG.
     """
     share = _share_of_full_speed(config, command)
     s, c = state.clock
@@ -150,7 +156,7 @@ def reference_pose(
 
 
 def pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:
-    """[16] with each named joint's share on one side, zero elsewhere."""
+    """[16] the share of each named joint of one side; zero for all other joints."""
     values = np.zeros(len(robot.joint_names))
     for joint, share in shares.items():
         values[robot.joint_names.index(f"{side}_{joint}_joint")] = share

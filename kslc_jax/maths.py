@@ -1,6 +1,7 @@
-"""Quaternions, frames and norms: one vector at a time, vmapped by the caller.
+"""Quaternions, frames and norms. Each function takes one vector; the caller vmaps.
 
-Quaternions are (w, x, y, z), unit length, and rotate body-frame vectors into the world frame.
+Quaternions are (w, x, y, z) and have unit length. They rotate vectors from the body frame to the
+world frame.
 """
 
 import jax
@@ -20,7 +21,10 @@ def quat_rotate_inverse(q: jax.Array, v: jax.Array) -> jax.Array:
 
 
 def quat_to_euler(q: jax.Array) -> jax.Array:
-    """Roll, pitch, yaw [3] in rad of `q` [4] (x-y-z fixed axes), each in [-pi, pi]."""
+    """Roll, pitch, yaw [3, rad] of `q` [4], about the fixed axes x, y, z.
+
+    Roll and yaw lie in [-pi, pi], pitch in [-pi/2, pi/2].
+    """
     w, x, y, z = q
     roll = jnp.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = jnp.arcsin(jnp.clip(2.0 * (w * y - z * x), -1.0, 1.0))
@@ -39,5 +43,5 @@ def norm(x: jax.Array) -> jax.Array:
 
 
 def tree_where(condition: jax.Array, if_true, if_false):
-    """Selects whole pytrees by one scalar condition."""
+    """Returns the pytree `if_true` where the scalar `condition` [] holds, else `if_false`."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), if_true, if_false)

@@ -1,6 +1,6 @@
-"""The motors: PD torque within their limits, and the damping that the engines take implicitly.
+"""Motors: PD torque within speed-dependent limits, and its damping for the implicit integrators.
 
-The two engines share these functions: `xp` is numpy or jax.numpy.
+Both engines share these functions: `xp` is numpy or jax.numpy.
 """
 
 from typing import Any
@@ -10,35 +10,39 @@ import jax.numpy as jnp
 from kslc_jax.robot import Robot
 
 TORQUE_KNEE = 0.75
-"""Share of a joint's speed limit above which its driving torque falls, linearly, to zero."""
+"""Share of the joint's speed limit above which its driving torque falls linearly.
+
+The torque is zero at the limit."""
 
 SERVO_DAMPING = 2
-"""Where -damping stands in a servo's `actuator_biasprm`."""
+"""Index of -damping in a position servo's `actuator_biasprm`."""
 
 THETA = 0.6
-"""theta: share of a step's motor torque taken from its end. 1, backward Euler, brakes at 5 ms what
-moves freely at 1 ms; below 0.5 it is unstable."""
+"""theta of the theta-method: weight of the motor torque at the end of a physics step.
+
+The torque at its start has the weight 1 - theta. theta = 1 is backward Euler: at 5 ms it slows
+motions that 1 ms leaves free. Below 0.5 the method is unstable (docs/fidelity_physics.md)."""
 
 LEAST_CHANGE = 0.01
-"""Least change of joint speed [rad/s] over which `motor_damping` takes a chord."""
+"""Smallest change of joint speed [rad/s] over which `motor_damping` measures the slope."""
 
 FRICTION_SPEED = 0.2
-"""Joint speed [rad/s] at which Coulomb friction is 76 % grown (tanh keeps it smooth)."""
+"""Joint speed [rad/s] at which Coulomb friction has 76 % of its full size (smoothed by tanh)."""
 
 
 def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
-    """PD torque within the motor's limits, minus joint friction [16, N m].
+    """PD torque within the motor's limits, minus joint friction [..., 16, N m].
 
-    clip(kp (target - q) - kd dq, lower, upper): in the driving direction the available torque
-    falls on a line from its full value (0.85 x effort limit x strength) at 75 % of the joint's
-    speed limit to zero at the limit, and on from there: a motor that is turned faster than it can
-    turn by itself brakes. Braking keeps all of the torque.
+    clip(kp (target - q) - kd dq, lower, upper). The full torque is effort_limit x motor_strength.
+    In the driving direction the available torque is full up to 75 % of the joint's speed limit. It
+    then falls linearly: to zero at the limit, and below zero beyond it, so that a motor above its
+    limit brakes. In the braking direction the torque is always full.
 
     Args:
       robot: gains and limits.
-      dynamics: factors on them, see `Dynamics`.
+      dynamics: factors on gains and limits, see `Dynamics`.
       q, dq, target: joint angles [rad], speeds [rad/s], target angles [rad], [..., 16].
-      xp: numpy or jax.numpy; the two engines share this function.
+      xp: numpy or jax.numpy.
     """
     pd = dynamics.kp * robot.kp * (target - q) - dynamics.kd * robot.kd * dq
     full = robot.effort_limit * dynamics.motor_strength
@@ -49,12 +53,13 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
 
 
 def motor_damping(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any = jnp):
-    """How `motor_torque` falls with joint speed over the coming physics step [16, N m s/rad], from
-    its present `torque`.
+    """Damping [..., 16, N m s/rad] that the motors have over the next physics step.
 
-    The engines take it implicitly: full torque would carry an unloaded shank by 20 rad/s in 5 ms.
-    It is `THETA` times the slope of the chord from the present speed to that at the end of the
-    step, so that a joint alone moves by the theta-method.
+    It is `THETA` times the mean slope of `motor_torque`, from the present speed and `torque` to the
+    expected speed at the end of the step. A joint alone then moves by the theta-method.
+
+    The engines integrate this damping implicitly. Without it, full torque would change the speed of
+    an unloaded shank by 20 rad/s in 5 ms.
     """
     change = _speed_ahead(robot, dynamics, q, dq, target, torque, xp) - dq
     change = xp.where(xp.abs(change) < LEAST_CHANGE, LEAST_CHANGE, change)
@@ -63,11 +68,11 @@ def motor_damping(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any = 
 
 
 def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
-    """Joint speed [16] at the end of the step, were each joint alone with its inertia.
+    """Joint speed [..., 16, rad/s] at the end of the step if each joint moved alone.
 
-    v = dq + h / inertia ((1 - theta) torque + theta torque(v)), solved for each straight piece of
-    the torque's law. The law falls with v, so that the solutions are clipped by each other as the
-    pieces are.
+    Solves v = dq + h / inertia ((1 - theta) torque + theta torque(v)) with `robot.joint_inertia`.
+    torque(v) leaves out joint friction. It is a clip of linear pieces. Each piece has one solution.
+    The pieces never rise with v, so clipping their solutions in the same way solves the whole law.
     """
     rate = robot.mj_model.opt.timestep / robot.joint_inertia
     start, rate = dq + (1.0 - THETA) * rate * torque, THETA * rate
@@ -85,14 +90,14 @@ def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
 
 
 def servo_control(robot: Robot, torque, damping, q, dq):
-    """Control signal that makes position servos kp (ctrl - q) - damping dq give `torque`."""
+    """Control [..., 16] that makes the servos' kp (ctrl - q) - damping dq equal to `torque`."""
     return q + (torque + damping * dq) / robot.kp
 
 
 def drive(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
-    """(motor torque, servos' control, servos' bias on joint speed) of one physics step, [..., 16].
+    """(motor torque, servo control, servo bias on joint speed) of one physics step, each [..., 16].
 
-    The last one belongs to `actuator_biasprm[..., SERVO_DAMPING]`.
+    Write the bias to `actuator_biasprm[..., SERVO_DAMPING]`.
     """
     torque = motor_torque(robot, dynamics, q, dq, target, xp)
     damping = motor_damping(robot, dynamics, q, dq, target, torque, xp)

@@ -1,4 +1,7 @@
-"""Actor and critic: ELU networks over stacked frames; diagonal Gaussian with a free deviation."""
+"""Actor, critic and velocity estimator: ELU networks over stacked frames.
+
+The policy is a diagonal Gaussian. Its standard deviation is a parameter, independent of the state.
+"""
 
 from dataclasses import dataclass
 from typing import Any, cast
@@ -14,22 +17,22 @@ from kslc_jax import robot as robot_lib
 from kslc_jax.config import NUM_JOINTS, Config
 
 Params = dict[str, Any]
-"""{'actor': flax params, 'critic': flax params, 'log_std': [16]}, and 'estimator' where the config
-has one."""
+"""{'actor': flax params, 'critic': flax params, 'log_std': [16]}, and 'estimator': flax params if
+the config has one."""
 
 ACTING = ("actor", "estimator", "log_std")
-"""What of the parameters a policy acts with; the critic is there for training only."""
+"""Names of the parameters that a policy needs to act. Only training needs the critic."""
 
 ESTIMATED = 3
-"""Numbers that an estimator gives: the base's velocity, base frame, scaled as for the critic."""
+"""Outputs of the estimator: the base's velocity, base frame, scaled as in the critic's frame."""
 
 _LOG_2PI = 1.8378770664093453
 _HALF = 0.5**0.5
-"""Keeps the variance of a sum or difference of two."""
+"""sqrt(1/2). With this factor the sum and the difference of two values keep their variance."""
 
 
 class MLP(nn.Module):
-    """Dense layers with ELU between them, over the flattened last two axes [..., K, W]."""
+    """Dense layers with ELU between them. The input is flattened over its last two axes."""
 
     hidden: tuple[int, ...]
     outputs: int
@@ -37,7 +40,7 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, frames: jax.Array, *beside: jax.Array) -> jax.Array:
-        """Outputs [..., O] for frames [..., K, W] and what the actor reads beside them [..., V]."""
+        """Outputs [..., O] for frames [..., K, W] and additional inputs `beside`, each [..., V]."""
         x = jnp.concatenate([_flat(frames), *beside], axis=-1)
         for size in self.hidden:
             x = nn.elu(nn.Dense(size)(x))
@@ -46,19 +49,19 @@ class MLP(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class Parity:
-    """Orthonormal bases of the vectors [W] that a mirror map keeps and of those that it negates."""
+    """Orthonormal bases of the even (M x = x) and odd (M x = -x) vectors [W] of a mirror map M."""
 
     even: np.ndarray  # [W, E]
     odd: np.ndarray  # [W, W - E]
 
 
 def parity(permutation: np.ndarray, sign: np.ndarray) -> Parity:
-    """Bases for the mirror map v -> v[permutation] * sign, which undoes itself."""
+    """Bases for the mirror map v -> v[permutation] * sign, which must be its own inverse."""
     eye = np.eye(len(sign), dtype=np.float32)
     mirror = eye[permutation] * sign[:, None]
 
     def basis(projected: np.ndarray) -> np.ndarray:
-        # A vector and its mirror image have the same projection but for the sign: keep the first.
+        # The projections of a unit vector and its mirror image differ only in sign: keep the first.
         kept = projected[:, np.arange(len(sign)) <= permutation]
         norm = np.linalg.norm(kept, axis=0)
         return kept[:, norm > 0] / norm[norm > 0]
@@ -67,11 +70,11 @@ def parity(permutation: np.ndarray, sign: np.ndarray) -> Parity:
 
 
 class MirrorMLP(nn.Module):
-    """An MLP that commutes with mirroring: f(M x) = M f(x), exactly and for all weights.
+    """An MLP that commutes with the mirror map M: f(M x) = M f(x), for all weights.
 
-    Hidden units come in pairs, one for each side of the robot, which M swaps. A linear map commutes
-    with M if and only if it keeps even parts (M x = x) and odd parts (M x = -x) apart, so each
-    dense layer is two of half the width: half the work of the unconstrained layer.
+    Hidden units form pairs, one unit for each side of the robot, and M swaps the two. A linear map
+    commutes with M if and only if it maps even vectors to even ones and odd vectors to odd ones. So
+    each dense layer consists of two layers of half the width: half the work of a free layer.
     """
 
     hidden: tuple[int, ...]
@@ -82,7 +85,7 @@ class MirrorMLP(nn.Module):
 
     @nn.compact
     def __call__(self, frames: jax.Array, *beside: jax.Array) -> jax.Array:
-        """Outputs [..., O] for frames [..., K, W] and what the actor reads beside them [..., V]."""
+        """Outputs [..., O] for frames [..., K, W] and additional inputs `beside`, each [..., V]."""
         even, odd = _flat(frames @ self.inputs.even), _flat(frames @ self.inputs.odd)
         for extra, basis in zip(beside, self.beside, strict=True):
             even = jnp.concatenate([even, extra @ basis.even], axis=-1)
@@ -100,11 +103,12 @@ class MirrorMLP(nn.Module):
 
 
 def _kernel_init(scale: float) -> nn.initializers.Initializer:
-    """Unit-variance outputs for unit-variance inputs, times `scale`."""
+    """Initial weights that give outputs of deviation `scale` for inputs of unit variance."""
     return nn.initializers.variance_scaling(scale**2, "fan_in", "truncated_normal")
 
 
 def _flat(frames: jax.Array) -> jax.Array:
+    """[..., K, W] -> [..., K * W]."""
     return frames.reshape(*frames.shape[:-2], -1)
 
 
@@ -125,7 +129,7 @@ class Gaussian:
         return jnp.sum(-0.5 * jnp.square(z) - self.log_std - 0.5 * _LOG_2PI, axis=-1)
 
     def entropy(self) -> jax.Array:
-        """Differential entropy, the same for every mean."""
+        """Differential entropy []; it does not depend on the mean."""
         return jnp.sum(self.log_std + 0.5 * (1.0 + _LOG_2PI))
 
     def kl_from(self, old: "Gaussian") -> jax.Array:
@@ -170,7 +174,7 @@ def _critic(config: Config) -> nn.Module:
 
 
 def init(config: Config, key: jax.Array) -> Params:
-    """Fresh parameters."""
+    """Random initial parameters."""
     key_actor, key_critic = jax.random.split(key)
     beside = (jnp.zeros(ESTIMATED),) if config.network.estimator else ()
     history = jnp.zeros((config.env.frames, observations.ACTOR_WIDTH))
@@ -194,8 +198,11 @@ def policy(config: Config, params: Params, history: jax.Array) -> Gaussian:
 def policy_and_estimate(
     config: Config, params: Params, history: jax.Array
 ) -> tuple[Gaussian, jax.Array | None]:
-    """The same, and the estimated base velocity [..., 3] as in the critic's frame; None without an
-    estimator. The actor's loss does not train the estimator."""
+    """(action distribution, estimated base velocity [..., 3]) for actor histories [..., K, 59].
+
+    The estimate is scaled as in the critic's frame; it is None without an estimator. No gradient
+    flows from the actor into the estimator.
+    """
     estimate, beside = None, ()
     if config.network.estimator:
         variables = {"params": params["estimator"]}
@@ -206,7 +213,7 @@ def policy_and_estimate(
 
 
 def log_std(config: Config, params: Params) -> jax.Array:
-    """Log deviation [16] of the policy; the same for both sides if it is symmetric."""
+    """Log standard deviation [16] of the policy; equal on both sides if it is symmetric."""
     free = params["log_std"]
     if not config.network.symmetric:
         return free

@@ -1,7 +1,7 @@
-"""What actor and critic see: tables of components -> widths, slices, noise, mirroring, history.
+"""Observations of actor and critic: frames, histories, noise and mirroring.
 
-A frame is the concatenation of its table's components (paper, Table II; order and scales of
-Humanoid-Gym). Training, evaluation and export all build frames here.
+A table of components defines each frame. A frame is the concatenation of its components (paper,
+Table II; order and scales of Humanoid-Gym). Training, evaluation and export all build frames here.
 """
 
 import functools
@@ -22,17 +22,22 @@ from kslc_jax.signals import Signals
 
 Mirror = Literal["negate", "keep", "joints", "swap", "polar", "axial", "command"]
 
-# Signs under mirroring in the sagittal plane: polar vectors (velocities) flip y, axial ones (rates,
-# roll-pitch-yaw) flip x and z. Commands are (vx, vy, yaw rate).
+# Signs under mirroring in the sagittal plane. Polar vectors (velocities) flip y. Axial vectors
+# (angular rates, roll-pitch-yaw) flip x and z. Commands are (vx, vy, yaw rate).
 POLAR = (1, -1, 1)
 _SIGNS = {"polar": POLAR, "axial": (-1, 1, -1), "command": (1, -1, -1)}
 
 MASS_SCALE = 30.0
+"""Mass [kg] of the base link that the critic sees as 1."""
 
 
 @dataclass(frozen=True)
 class Component:
-    """One block of a frame: its width, scale, noise (before noise_level), and mirror rule."""
+    """One block of a frame.
+
+    `noise` is a standard deviation, before `scale` and `noise_level`. `mirror` is the rule for the
+    mirrored robot.
+    """
 
     name: str
     width: int
@@ -70,7 +75,7 @@ CRITIC: tuple[Component, ...] = (
 
 
 def width(table: tuple[Component, ...]) -> int:
-    """Numbers per frame."""
+    """Width of a frame: the number of its values."""
     return sum(c.width for c in table)
 
 
@@ -79,19 +84,20 @@ CRITIC_WIDTH = width(CRITIC)
 
 
 def slices(table: tuple[Component, ...]) -> dict[str, slice]:
-    """Where each component lies in its frame."""
+    """Slice of each component in its frame, by name."""
     ends = np.cumsum([c.width for c in table])
     return {c.name: slice(int(e) - c.width, int(e)) for c, e in zip(table, ends, strict=True)}
 
 
 def row(table: tuple[Component, ...], field: str) -> np.ndarray:
+    """[W] the named field ("scale" or "noise") of the component that each value belongs to."""
     parts = [np.broadcast_to(getattr(c, field), (c.width,)) for c in table]
     return np.concatenate(parts).astype(np.float32)
 
 
 @flax.struct.dataclass
 class Sources:
-    """Everything that frames are made of."""
+    """Inputs from which frames are computed."""
 
     signals: Signals
     gait: GaitState
@@ -99,8 +105,8 @@ class Sources:
     dynamics: Dynamics
     reference: jax.Array  # [16] rad
     last_action: jax.Array  # [16]
-    push: jax.Array  # [5] m/s and rad/s, the last push
-    base_mass: jax.Array  # [] kg of the base link
+    push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
+    base_mass: jax.Array  # [] kg, mass of the base link
 
 
 def _values(src: Sources) -> dict[str, jax.Array]:
@@ -126,12 +132,13 @@ def _values(src: Sources) -> dict[str, jax.Array]:
 
 
 def _frame(table: tuple[Component, ...], src: Sources) -> jax.Array:
+    """[W] the scaled components of the table, without noise."""
     values = _values(src)
     return jnp.concatenate([values[c.name] for c in table]) * row(table, "scale")
 
 
 def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
-    """Noisy actor frame [59]; noise is scaled with its component, as in HG."""
+    """Actor frame [59] with noise, clipped. The noise is scaled like its component (HG)."""
     frame = _frame(ACTOR, src)
     level = config.noise_level * src.dynamics.noise
     scale = level * row(ACTOR, "noise") * row(ACTOR, "scale")
@@ -140,7 +147,7 @@ def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
 
 
 def critic_frame(config: EnvConfig, src: Sources) -> jax.Array:
-    """Privileged frame [89], without noise."""
+    """Critic frame [89] without noise, clipped."""
     frame = _frame(CRITIC, src)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 
@@ -149,7 +156,7 @@ def critic_frame(config: EnvConfig, src: Sources) -> jax.Array:
 
 
 def append_frame(history: jax.Array, frame: jax.Array) -> jax.Array:
-    """Appends `frame` [W] to `history` [K, W], oldest first."""
+    """Appends `frame` [W] to `history` [K, W], and drops the oldest frame. Oldest first."""
     return jnp.concatenate([history[1:], frame[None]])
 
 
@@ -158,7 +165,7 @@ def append_frame(history: jax.Array, frame: jax.Array) -> jax.Array:
 
 @functools.lru_cache(maxsize=8)
 def mirror_map(table: tuple[Component, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """(permutation, sign) such that frame[permutation] * sign is the mirrored robot's frame."""
+    """(permutation [W], sign [W]): frame[permutation] * sign is the frame of the mirrored robot."""
     joints, joint_sign = robot_lib.mirror_joints()
     permutation, sign = np.arange(width(table)), np.ones(width(table), np.float32)
     for c in table:

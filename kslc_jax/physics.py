@@ -1,13 +1,13 @@
 """One control step of the robot: joint targets -> PD torques -> decimated physics -> PhysicsState.
 
-Two engines behind one signature, same model and same numbers within float32:
+Two engines have one signature and one model. Their results agree up to float32 rounding:
 
-- ``mjx``: MJX's JAX implementation, pure XLA, any device.
-- ``mujoco``: C MuJoCo's ``mujoco.batch.Batch`` on all CPU cores behind one numpy-only
-  ``jax.pure_callback`` (vmapped environments arrive in it as one batch).
+- ``mjx``: MJX's JAX implementation, pure XLA, on any device.
+- ``mujoco``: C MuJoCo's ``mujoco.batch.Batch`` on the CPU cores, called by one
+  ``jax.pure_callback`` that uses numpy only. Vmapped environments arrive in it as one batch.
 
-Only qpos, qvel, the solver's warm start and the sensors cross a step: a whole ``mjx.Data`` is 16 KB
-an environment.
+Only the small `PhysicsState` is passed from step to step: a whole ``mjx.Data`` takes 16 KB per
+environment.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-with contextlib.redirect_stdout(io.StringIO()):  # mjx prints about an optional backend
+with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a notice about an optional backend
     from mujoco import mjx
 
 from kslc_jax import robot as robot_lib
@@ -36,19 +36,19 @@ from kslc_jax.robot import Robot
 
 @flax.struct.dataclass
 class PhysicsState:
-    """What the next control step, and every signal, is computed from."""
+    """Physics of one environment. The next control step and all signals are computed from it."""
 
     qpos: jax.Array  # [23] base position [m], base quaternion (w, x, y, z), joint angles [rad]
     qvel: (
         jax.Array
     )  # [22] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
-    qacc_warmstart: jax.Array  # [22] contact solver's start
+    qacc_warmstart: jax.Array  # [22] start of the contact solver
     sensordata: jax.Array  # [S] named sensors of the model, see Robot.sensor
-    torque: jax.Array  # [16] motor torque less joint friction, last physics step [N m]
+    torque: jax.Array  # [16] motor torque minus joint friction, last physics step [N m]
 
 
 def robot_for(config: PhysicsConfig) -> Robot:
-    """The robot at the config's fidelity, timestep and solver settings (cached)."""
+    """The robot with the config's fidelity, timestep and solver settings (cached)."""
     return robot_lib.load(
         config.fidelity,
         timestep=config.timestep,
@@ -58,14 +58,14 @@ def robot_for(config: PhysicsConfig) -> Robot:
 
 
 def resolve_engine(config: PhysicsConfig) -> str:
-    """'mjx' or 'mujoco'; 'auto' takes mjx where JAX has an accelerator."""
+    """'mjx' or 'mujoco'. 'auto' means mjx if JAX has an accelerator, else mujoco."""
     if config.engine != "auto":
         return config.engine
     return "mujoco" if jax.default_backend() == "cpu" else "mjx"
 
 
 def initial_state(config: PhysicsConfig, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-    """State before any step; sensors hold the home pose's values until the first step."""
+    """State before the first step. Its sensors have the values of the home pose, without touch."""
     model = robot_for(config).mj_model
     return PhysicsState(
         qpos=qpos,
@@ -124,7 +124,7 @@ def _mjx_model(config: PhysicsConfig) -> mjx.Model:
 
 
 def _own_device() -> jax.Device:
-    """MJX would take the first device of all processes, which may be another one's."""
+    """First device of this process. MJX's default may be a device of another process."""
     return jax.local_devices()[0]
 
 
@@ -162,7 +162,10 @@ def _step_mjx(
 
 
 def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Position and velocity sensors at the new state; contact sensors stay the last step's."""
+    """Recomputes position and velocity sensors at the new state.
+
+    Touch sensors keep the forces of the last physics step.
+    """
     data = mjx.com_pos(model, mjx.kinematics(model, data))
     data = mjx.com_vel(model, data)
     return mjx.sensor_vel(model, mjx.sensor_pos(model, data))
@@ -175,8 +178,8 @@ _batches_lock = threading.Lock()
 
 
 def _batch(robot: Robot, size: int, threads: int, written: frozenset[str]) -> mujoco.batch.Batch:
-    """The cached simulator batch of this size; its state and the fields `written` are overwritten
-    at every call, all others are the robot's."""
+    """Simulator batch of this size (cached). Every call of `_host_step` overwrites its state and the
+    model fields `written`; all other fields are the robot's."""
     key = (robot, size, threads, written)
     if key not in _batches:
         _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
@@ -212,7 +215,10 @@ def _host_step(
     fields: dict[str, np.ndarray],
     force: np.ndarray | None,
 ) -> PhysicsState:
-    """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us."""
+    """One control step of a batch in C MuJoCo; numpy in, numpy out.
+
+    It must not run JAX: that would wait for the running program, which waits for this callback.
+    """
     lead = np.shape(target)[:-1]
     robot = robot_for(config)
 

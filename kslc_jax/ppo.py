@@ -1,4 +1,10 @@
-"""PPO with a KL-adaptive learning rate. Knows no environment: arrays in, a new Learner out."""
+"""PPO with a KL-adaptive learning rate. It knows no environment: arrays in, a new Learner out.
+
+`Samples` hold an index in place of each observation, and `PolicyAtIndex` evaluates the networks at
+such indices. The reason is memory: an observation is a window of the last K frames, so a copy per
+sample would store each frame up to K times. The rollout stores each frame once. `PolicyAtIndex`
+gathers the windows of one minibatch at a time (`rollout.windows`).
+"""
 
 from collections.abc import Callable
 
@@ -14,47 +20,47 @@ from kslc_jax.networks import ACTING, Gaussian, Params
 
 @flax.struct.dataclass
 class Learner:
-    """Everything an update changes."""
+    """State that an update changes."""
 
     params: Params
-    average: Params  # of the parameters that the policy acts with, see PPOConfig.average
+    average: Params  # average of the acting parameters, see PPOConfig.average
     opt_state: optax.OptState
     learning_rate: jax.Array  # []
-    rate_ceiling: jax.Array  # [] what the learning rate may reach; lowered after bad numbers
+    rate_ceiling: jax.Array  # [] upper limit of the learning rate; lowered after non-finite values
 
 
 @flax.struct.dataclass
 class Samples:
-    """What PPO needs of each step of a rollout, [T, N, ...] or any leading axes."""
+    """Data of each rollout step for PPO, with leading axes [T, N] or others."""
 
-    index: jax.Array  # [] int, names the observation for `PolicyAtIndex`
+    index: jax.Array  # [] int, index of the observation, see the module docstring
     action: jax.Array  # [16]
     mean: jax.Array  # [16] of the policy that acted
-    log_prob: jax.Array  # [] of the action under it
-    value: jax.Array  # []
+    log_prob: jax.Array  # [] of the action, under that policy
+    value: jax.Array  # [] of the critic at the rollout
     advantage: jax.Array  # []
     target: jax.Array  # [] value target
-    valid: jax.Array  # [] bool, False: not to be learnt from
+    valid: jax.Array  # [] bool, False: the loss ignores this sample
 
 
 @flax.struct.dataclass
 class RolloutConstants:
-    """What all samples of a rollout share."""
+    """Values that all samples of a rollout share."""
 
     log_std: jax.Array  # [16] of the policy that acted
-    entropy_coef: jax.Array  # [] weight of the entropy bonus in their update
+    entropy_coef: jax.Array  # [] weight of the entropy bonus in the update
 
 
 CEILING_GROWTH = 1.02
-"""Factor on the ceiling of the learning rate per update: a halved one is whole after 36."""
+"""Growth of the learning-rate ceiling per update. After one halving it is back in 36 updates."""
 
 PolicyAtIndex = Callable[[Params, jax.Array], tuple[Gaussian, jax.Array, jax.Array]]
-"""(params, indices [B]) -> (action distribution, values [B], squared error of the estimated
-velocity [B], zero without an estimator) at those observations."""
+"""(params, indices [B]) -> (action distribution, values [B], squared errors [B] of the estimated
+velocity). The errors are zero without an estimator. See the module docstring."""
 
 
 def optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam on clipped gradients; the learning rate is applied outside, it adapts."""
+    """Adam on clipped gradients. `gradient_step` applies the learning rate, because it adapts."""
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.scale_by_adam())
 
 
@@ -71,7 +77,7 @@ def acting(params: Params) -> Params:
 
 
 def deployed(learner: Learner) -> Params:
-    """The networks as a policy uses them: the actor is the average over the last updates."""
+    """The parameters that are saved as a policy: acting parameters averaged over updates."""
     return {**learner.params, **learner.average}
 
 
@@ -89,12 +95,12 @@ def gae(
     delta_t = r_t + gamma V_{t+1} (1 - done_t) - V_t
     A_t = delta_t + gamma lam (1 - done_t) A_{t+1}
 
-    A time-out is not a failure: there r_t gains gamma V_t in place of the value it was cut from
-    (Humanoid-Gym; the state after the cut is gone).
+    A time-out is not a failure. At a time-out, gamma V_t is added to r_t: it stands for
+    gamma V_{t+1}, because the state after the time-out is not kept (Humanoid-Gym).
 
     Args:
       reward, value, done, truncated: [T]; `done` is terminated or truncated.
-      last_value: [] V_T.
+      last_value: [] V_T, value of the state after the last step.
       gamma, lam: discount and GAE factor.
 
     Returns:
@@ -122,8 +128,11 @@ def loss(
     params: Params,
     batch: Samples,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate + clipped value loss - entropy bonus + error of the velocity estimate, over
-    the valid samples of `batch`."""
+    """(loss [], metrics) over the valid samples of `batch`.
+
+    The loss is the clipped surrogate + clipped value loss - entropy bonus + squared error of the
+    velocity estimate.
+    """
     dist, value, estimate_error = apply(params, batch.index)
     weight = batch.valid / jnp.maximum(jnp.sum(batch.valid), 1)
 
@@ -155,8 +164,10 @@ def loss(
 def adapt_learning_rate(
     config: PPOConfig, rate: jax.Array, kl: jax.Array, ceiling: jax.Array | float = jnp.inf
 ) -> jax.Array:
-    """Lowers the rate where KL > 2 desired, raises it where KL < desired / 2, up to the ceiling and
-    within bounds."""
+    """Lowers the rate [] if KL > 2 desired, and raises it if 0 < KL < desired / 2.
+
+    The result lies within the configured bounds, and below the ceiling where the bounds allow it.
+    """
     rate = jnp.where(kl > 2.0 * config.desired_kl, rate / config.learning_rate_factor, rate)
     slow = (kl > 0.0) & (kl < 0.5 * config.desired_kl)
     rate = jnp.where(slow, rate * config.learning_rate_factor, rate)
@@ -170,7 +181,10 @@ def gradient_step(
     learner: Learner,
     batch: Samples,
 ) -> tuple[Learner, dict[str, jax.Array]]:
-    """One minibatch. A non-finite gradient changes nothing and is counted in `skipped`."""
+    """One Adam step on one minibatch.
+
+    A non-finite gradient changes nothing; the metric `skipped` is then 1.
+    """
     grads, info = jax.grad(loss, argnums=3, has_aux=True)(
         config, apply, constants, learner.params, batch
     )
@@ -193,7 +207,11 @@ def update(
     samples: Samples,
     key: jax.Array,
 ) -> tuple[Learner, dict[str, jax.Array]]:
-    """All epochs of one rollout's samples [B, ...]: shuffled, one gradient step a minibatch."""
+    """All epochs over the samples [B, ...] of one rollout.
+
+    Each epoch shuffles them and takes one gradient step per minibatch. Returns the new learner and
+    the mean metrics.
+    """
     ceiling = jnp.minimum(CEILING_GROWTH * learner.rate_ceiling, config.learning_rate_bounds[1])
     learner = learner.replace(rate_ceiling=ceiling)
     samples = samples.replace(advantage=_normalise(samples.advantage, samples.valid))
@@ -213,13 +231,13 @@ def update(
 
 
 def averaged(config: PPOConfig, average: Params, newest: Params) -> Params:
-    """The exponential average one update later."""
+    """Updates the exponential average with the newest parameters."""
     keep = config.average
     return jax.tree.map(lambda a, b: keep * a + (1.0 - keep) * b, average, newest)
 
 
 def _normalise(advantage: jax.Array, valid: jax.Array) -> jax.Array:
-    """Zero mean and unit deviation over the valid samples of the whole batch (HG)."""
+    """Scales to zero mean and unit deviation over the valid samples of the whole batch (HG)."""
     mean = jnp.mean(advantage, where=valid)
     std = jnp.std(advantage, where=valid)
     return (advantage - mean) / (std + 1e-8)

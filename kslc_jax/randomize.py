@@ -1,4 +1,4 @@
-"""Domain randomisation: what differs from robot to robot, sampled anew at every reset."""
+"""Domain randomisation: physical parameters that differ per robot, sampled at every reset."""
 
 import flax.struct
 import jax
@@ -8,28 +8,28 @@ from kslc_jax.config import NUM_JOINTS, RandomizeConfig, Range
 from kslc_jax.robot import Robot
 
 LINKS = NUM_JOINTS + 1
-"""The base, and the link after each joint."""
+"""Number of randomised links: the base, and the link after each joint."""
 
 
 @flax.struct.dataclass
 class Dynamics:
     """Physical parameters of one episode."""
 
-    friction: jax.Array  # [] sliding friction of the feet, before averaging with the ground's
+    friction: jax.Array  # [] sliding friction of the feet, not yet averaged with the ground
     base_mass: jax.Array  # [] kg added to the base link
     base_com: jax.Array  # [3] m, shift of the base link's centre of mass, base frame
     kp: jax.Array  # [16] factor on the position gain
     kd: jax.Array  # [16] factor on the velocity gain
     motor_strength: jax.Array  # [16] factor on the available torque
     joint_friction: jax.Array  # [16] N m
-    link_mass: jax.Array  # [17] factor on mass and inertia: the base, then each joint's link
-    link_com: jax.Array  # [17, 3] m, shift of the centre of mass, link frame
-    hand_mass: jax.Array  # [] kg added to each arm's last link
+    link_mass: jax.Array  # [17] factor on mass and inertia, order of robot.link_body_ids
+    link_com: jax.Array  # [17, 3] m, shift of the centre of mass, link frame, same order
+    hand_mass: jax.Array  # [] kg added to the last link of each arm
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
 
 
 def nominal(friction: float = 1.0) -> Dynamics:
-    """The robot as described: no randomisation."""
+    """Parameters of the model file, without randomisation."""
     return Dynamics(
         friction=jnp.asarray(friction),
         base_mass=jnp.zeros(()),
@@ -46,7 +46,7 @@ def nominal(friction: float = 1.0) -> Dynamics:
 
 
 def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
-    """Draws the parameters of one episode, each uniform in its configured range."""
+    """Draws the parameters of one episode. Each is uniform in its configured range."""
     keys = jax.random.split(key, 11)
 
     def uniform(key: jax.Array, bounds: Range, shape: tuple[int, ...] = ()) -> jax.Array:
@@ -68,11 +68,12 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
 
 
 def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> dict[str, jax.Array]:
-    """The mjModel fields that `dynamics` changes, by name; both engines take them as they are.
+    """New values of the mjModel fields that `dynamics` changes, by name, for both engines.
 
-    Friction is the mean of foot and ground, PhysX's rule (MuJoCo would take the larger); a link's
-    inertia scales with its mass. Derived constants other than the subtree masses keep their nominal
-    values in both engines: they only scale the contact regularisation.
+    Contact friction is the mean of foot and ground, as in PhysX; MuJoCo's own rule takes the larger
+    one. The inertia of a link scales with its mass. The subtree masses are recomputed. All other
+    derived constants keep their nominal values in both engines: they only scale the contact
+    regularisation.
     """
     model, base, links = robot.mj_model, robot.base_body_id, robot.link_body_ids
     contact_friction = 0.5 * (dynamics.friction + ground_friction)
@@ -81,7 +82,7 @@ def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> di
     mass = mass.at[base].add(dynamics.base_mass)
     mass = mass.at[robot.hand_body_ids].add(dynamics.hand_mass)
     com = jnp.asarray(model.body_ipos).at[links].add(dynamics.link_com)
-    scale = mass[1:] / nominal_mass[1:]  # the world weighs nothing
+    scale = mass[1:] / nominal_mass[1:]  # body 0, the world, has no mass
     return {
         "geom_friction": jnp.asarray(model.geom_friction)
         .at[robot.foot_geom_ids, 0]

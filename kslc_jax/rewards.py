@@ -1,8 +1,8 @@
 """Reward terms: small pure functions of one environment's `Inputs`, and their weighted sum.
 
-Every term returns its unweighted value, which is logged. Terms are Humanoid-Gym's (HG) unless an
-equation of the paper is named; where an equation cannot mean what it says, docs/fidelity.md tells
-how it is read.
+Every term returns its unweighted value, which is logged. Terms are Humanoid-Gym's (HG) unless they
+name an equation of the paper, or say "ours". "As read": the printed equation is open or cannot
+work, and docs/fidelity.md gives our reading.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from kslc_jax.signals import Signals
 
 @flax.struct.dataclass
 class Inputs:
-    """What rewards may read. `last_*` are of the control step before."""
+    """Inputs of the reward terms. `last_*` are values of the control step before."""
 
     signals: Signals
     gait: GaitState
@@ -32,7 +32,7 @@ class Inputs:
     last_last_action: jax.Array  # [16]
     last_joint_vel: jax.Array  # [16] rad/s
     last_base_velocity: jax.Array  # [6] world, m/s and rad/s
-    v_max: jax.Array  # [] m/s, the curriculum's
+    v_max: jax.Array  # [] m/s, upper end of the commanded range
 
 
 Term = Callable[[RewardConfig, Robot, float, Inputs], jax.Array]
@@ -43,9 +43,9 @@ Term = Callable[[RewardConfig, Robot, float, Inputs], jax.Array]
 
 
 def angular_momentum(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Eq. 4 as read: clip(1 - exp(|L| / scale), c1, 0); zero at rest, falling with |L|."""
+    """Eq. 4 as read: clip(1 - exp(|L| / scale), c1, 0). It is 0 at rest and falls with |L|."""
     exponent = norm(x.signals.angular_momentum) / cfg.momentum_scale
-    # The exponent is capped where the clip acts anyway, so that exp cannot overflow.
+    # The cap on the exponent prevents an overflow of exp. The clip acts beyond it anyway.
     exponent = jnp.minimum(exponent, jnp.log(1.0 - cfg.momentum_floor))
     return jnp.clip(1.0 - jnp.exp(exponent), cfg.momentum_floor, 0.0)
 
@@ -54,10 +54,13 @@ def angular_momentum(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> j
 
 
 def base_height(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Eq. 6 as read: exp(-beta |h - (1 - gamma g) target|); HG's with g = 0."""
+    """Eq. 6 as read: exp(-beta |h - (1 - gamma g) target|); HG's form has gamma = 0.
+
+    h [m] is the height of the base above the soles of the stance feet.
+    """
     stance = x.gait.stance.astype(jnp.float32)
     feet = jnp.sum(x.signals.foot_pos[:, 2] * stance) / jnp.maximum(jnp.sum(stance), 1.0)
-    # Where the clock wants the robot to fly there is no stance foot: the floor counts.
+    # In a flight phase of the clock there is no stance foot: h is then above the floor.
     sole = jnp.where(jnp.any(x.gait.stance), feet - SOLE_DROP, 0.0)
     height = x.signals.base_pos[2] - sole
     drop = cfg.base_height_drop * speed_share(x.command, x.v_max) if cfg.velocity_rewards else 0.0
@@ -66,7 +69,11 @@ def base_height(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
 
 def feet_clearance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Eq. 7 as read: swing mask times exp(-|h - (1 + gain g) target| / width); else HG's window."""
+    """Eq. 7 as read: sum over the swing feet of exp(-|h - (1 + gain g) target| / width).
+
+    h [m] is the swing height. With `clearance_mid_swing` each foot is weighted with
+    2 sin^2(phase). HG's form counts the swing feet with |h - target| < width.
+    """
     swing = ~x.gait.stance
     if not cfg.velocity_rewards:
         near = jnp.abs(x.gait.swing_height - cfg.clearance_target) < cfg.clearance_width
@@ -78,7 +85,10 @@ def feet_clearance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
 
 
 def joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Eq. 8 as read: errors weighted by exp(-|speed| / speed limit); HG's without that factor."""
+    """Eq. 8 as read: exp(-kernel n) - penalty clip(n, 0, c2), with n = |w (q - reference)|.
+
+    w = exp(-|joint speed| / speed limit) for each joint; HG's form has w = 1.
+    """
     error = x.signals.joint_pos - x.reference
     if cfg.velocity_rewards:
         error = error * jnp.exp(-jnp.abs(x.signals.joint_vel) / robot.speed_limit)
@@ -91,7 +101,7 @@ def joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def tracking_lin_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """exp(-sigma |xy velocity error|^2), base frame; the curriculum's yardstick, at most 1."""
+    """exp(-sigma |xy velocity error|^2), base frame. At most 1; the curriculum is gated on it."""
     error = x.signals.base_linvel[:2] - x.command.velocity[:2]
     return jnp.exp(-cfg.tracking_sigma * jnp.sum(jnp.square(error)))
 
@@ -103,13 +113,16 @@ def tracking_ang_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> j
 
 
 def vel_mismatch_exp(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Little vertical velocity, roll rate and pitch rate."""
+    """Mean of exp(-10 vz^2) and exp(-5 |roll and pitch rate|), base frame."""
     vertical = jnp.exp(-10.0 * jnp.square(x.signals.base_linvel[2]))
     return 0.5 * (vertical + jnp.exp(-5.0 * norm(x.signals.base_angvel[:2])))
 
 
 def low_speed(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """-1 below half the commanded vx, 0 above 1.2 times, 1.2 between, -2 in the wrong direction."""
+    """Compares |vx| with the command: -1 below 0.5 times, 0 above 1.2 times, 1.2 between.
+
+    -2 in the wrong direction; 0 for commands up to 0.1 m/s.
+    """
     speed, command = x.signals.base_linvel[0], x.command.velocity[0]
     share = jnp.abs(speed) / jnp.maximum(jnp.abs(command), 1e-6)
     value = jnp.where(share < 0.5, -1.0, jnp.where(share > 1.2, 0.0, 1.2))
@@ -118,7 +131,10 @@ def low_speed(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sharp kernels minus a linear error, which has a gradient at any distance."""
+    """Sharp kernels of the velocity errors, minus 0.2 times the errors.
+
+    The linear part has a gradient at any distance.
+    """
     linear = norm(x.signals.base_linvel[:2] - x.command.velocity[:2])
     angular = jnp.abs(x.signals.base_angvel[2] - x.command.velocity[2])
     kernels = 0.5 * (jnp.exp(-10.0 * linear) + jnp.exp(-10.0 * angular))
@@ -126,15 +142,20 @@ def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
 
 
 def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """exp(-10 |xy error of the mean velocity|), the mean over about one gait cycle (ours).
+    """exp(-10 |xy error of the mean velocity|), times `_exactness` (ours).
 
-    Within a stride the speed swings by more than the error that matters over many strides."""
+    The mean is over about one gait cycle. Within a stride the speed varies by more than the mean
+    error that matters.
+    """
     exact = jnp.exp(-10.0 * norm(x.gait.mean_velocity - x.command.velocity[:2]))
     return exact * _exactness(cfg, x)
 
 
 def _exactness(cfg: RewardConfig, x: Inputs) -> jax.Array:
-    """Grows from 0 to 1 with the commanded range: being exact is for those who can walk."""
+    """Factor [] that grows from 0 to 1 while v_max grows from `exact_from` to `exact_full`.
+
+    Terms that demand exactness would hinder a policy that cannot walk yet.
+    """
     grown = (x.v_max - cfg.exact_from) / (cfg.exact_full - cfg.exact_from)
     return jnp.clip(grown, 0.0, 1.0)
 
@@ -143,28 +164,31 @@ def _exactness(cfg: RewardConfig, x: Inputs) -> jax.Array:
 
 
 def feet_contact_number(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Mean over the feet: 1 where contact and clock agree, -0.3 where not."""
+    """Mean over the feet: 1 if contact and clock agree, else -0.3."""
     return jnp.mean(jnp.where(x.signals.foot_contact == x.gait.stance, 1.0, -0.3))
 
 
 def feet_air_time(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Air time of the feet that landed, at most 0.5 s each."""
+    """Sum of the air times [s] of the feet that just landed, at most 0.5 s each."""
     return jnp.sum(jnp.clip(x.gait.landing, 0.0, 0.5))
 
 
 def foot_slip(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Root of the planar speed of the feet in contact."""
+    """Sum over the feet in contact of the square root of their planar speed [m/s]."""
     speed = norm(x.signals.foot_vel[:, :2])
     return jnp.sum(jnp.sqrt(speed) * x.signals.foot_contact)
 
 
 def feet_contact_forces(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Force above `max_contact_force`, at most 400 N a foot."""
+    """Sum of the foot forces [N] above `max_contact_force`, at most 400 N per foot."""
     return jnp.sum(jnp.clip(x.signals.foot_force - cfg.max_contact_force, 0.0, 400.0))
 
 
 def _spread(cfg: RewardConfig, x: Inputs, points: jax.Array, bounds: tuple[float, float]):
-    """Reward of keeping two points [2, 3] within `bounds` [m] of each other."""
+    """1 while the distance of two points [2, 3] lies within `bounds` [m]; falls fast outside.
+
+    The distance is planar, or with `lateral_distance` across the heading.
+    """
     apart = points[0] - points[1]
     lateral = jnp.abs(_heading_frame(x, apart)[1])
     distance = lateral if cfg.lateral_distance else norm(apart[:2])
@@ -174,19 +198,19 @@ def _spread(cfg: RewardConfig, x: Inputs, points: jax.Array, bounds: tuple[float
 
 
 def _heading_frame(x: Inputs, vector: jax.Array) -> jax.Array:
-    """World vector [3] in the frame turned by the robot's yaw."""
+    """Rotates a world vector [3] into the frame that is turned by the robot's yaw."""
     half = 0.5 * x.signals.base_euler[2]
     zero = jnp.zeros(())
     return quat_rotate_inverse(jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)]), vector)
 
 
 def feet_distance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Feet neither too near nor too far apart."""
+    """Keeps the distance of the feet within `feet_distance`, see `_spread`."""
     return _spread(cfg, x, x.signals.foot_pos, cfg.feet_distance)
 
 
 def knee_distance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Knees neither too near nor too far apart."""
+    """Keeps the distance of the knees within `knee_distance`, see `_spread`."""
     return _spread(cfg, x, x.signals.knee_pos, cfg.knee_distance)
 
 
@@ -194,7 +218,10 @@ def knee_distance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.
 
 
 def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Little leg roll and yaw; a faint pull of all joints to zero."""
+    """exp(-100 (x - 0.1)), at most 1, minus 0.01 |joint angles|.
+
+    x [rad] is the size of (roll, yaw) of the left leg plus that of the right leg.
+    """
     q = x.signals.joint_pos
     left, right = (robot.joint_names.index(f"{side}_leg_roll_joint") for side in ("left", "right"))
     legs = norm(q[left : left + 2]) + norm(q[right : right + 2])
@@ -202,7 +229,10 @@ def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> 
 
 
 def orientation(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Upright torso, but for the configured forward lean."""
+    """Two kernels of the torso's tilt: 1 at the target, upright by default.
+
+    The target leans forward by `lean_per_speed` times the commanded |vx|.
+    """
     lean = cfg.lean_per_speed * jnp.abs(x.command.velocity[0])
     roll, pitch = x.signals.base_euler[0], x.signals.base_euler[1] - lean
     upright = jnp.stack([jnp.sin(lean), jnp.zeros(())])
@@ -211,21 +241,23 @@ def orientation(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
 
 def base_acc(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Little change of the base's 6-D velocity over one step."""
+    """exp(-3 |change of the base's 6-D velocity over one control step|)."""
     return jnp.exp(-3.0 * norm(x.signals.base_velocity - x.last_base_velocity))
 
 
 def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """1 where the torso touches the ground."""
+    """1 if the torso touches the ground, else 0."""
     return x.signals.torso_contact.astype(jnp.float32)
 
 
 def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Motion, distance from the default pose and restless actions while asked to stand (ours).
+    """Joint motion, distance from the default pose and action changes while standing (ours).
 
-    The actions' changes count squared: what exploration adds is then the same for every policy,
-    and does not hide how it trembles by itself. It is so much at first that it would hide all else:
-    they count the more the wider the commanded range."""
+    It is 0 while the command is to move. Action changes enter squared: exploration noise then adds
+    on average the same amount for every mean action, and does not hide that the mean itself
+    trembles. The noise is large in early training and would dominate the term. So this part grows
+    with the commanded range, see `_exactness`.
+    """
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
     restless = cfg.restless * _exactness(cfg, x) * _action_change(x)
     return jnp.where(x.command.moving, 0.0, moved + restless)
@@ -235,33 +267,33 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
 
 def action_smoothness(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """First and second differences of the action, and its size."""
+    """Squared first and second differences of the action, plus 0.05 times its L1 norm."""
     second = jnp.sum(jnp.square(x.action + x.last_last_action - 2.0 * x.last_action))
     return _action_change(x) + second + 0.05 * jnp.sum(jnp.abs(x.action))
 
 
 def _action_change(x: Inputs) -> jax.Array:
-    """Squared change of the action since the control step before."""
+    """Sum of squared changes of the action since the control step before."""
     return jnp.sum(jnp.square(x.action - x.last_action))
 
 
 def torques(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sum of squared motor torques, less joint friction."""
+    """Sum of squared joint torques [N m]: motor torque minus joint friction."""
     return jnp.sum(jnp.square(x.signals.torque))
 
 
 def dof_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sum of squared joint speeds."""
+    """Sum of squared joint speeds [rad/s]."""
     return jnp.sum(jnp.square(x.signals.joint_vel))
 
 
 def dof_acc(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sum of squared joint accelerations over one control step."""
+    """Sum of squared joint accelerations [rad/s^2], from the speeds of two control steps."""
     return jnp.sum(jnp.square((x.signals.joint_vel - x.last_joint_vel) / dt))
 
 
 def dof_vel_limits(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Joint speed above `speed_limit_margin` of the limit, as a share of the limit (ours)."""
+    """Sum over the joints of (speed / limit - `speed_limit_margin`), each within [0, 1] (ours)."""
     over = jnp.abs(x.signals.joint_vel) / robot.speed_limit - cfg.speed_limit_margin
     return jnp.sum(jnp.clip(over, 0.0, 1.0))
 
@@ -302,7 +334,10 @@ TERMS: dict[str, Term] = {
 def evaluate(
     cfg: RewardConfig, robot: Robot, dt: float, x: Inputs
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """(reward [], raw value of every term): the weighted sum times `dt`, clipped at >= 0 (HG)."""
+    """(reward [], unweighted value of every term).
+
+    The reward is the weighted sum times `dt`. With `only_positive` it is at least 0 (HG).
+    """
     raw = {name: term(cfg, robot, dt, x) for name, term in TERMS.items()}
     total = dt * sum(getattr(cfg.weights, name) * value for name, value in raw.items())
     return jnp.maximum(total, 0.0) if cfg.only_positive else total, raw

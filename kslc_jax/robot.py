@@ -1,8 +1,10 @@
-"""The robot: our MJCF of XBot-L, and everything the rest asks of it by name.
+"""The robot: loads our MJCF of XBot-L and reads static facts from the compiled model.
 
-Two fidelities come from the one file: "train", where the soles meet the floor and capsules keep the
-limbs and the trunk apart, and "high", for evaluation: 1 ms, elliptic cones, converged solver,
-collision of all parts, joint friction.
+One file gives two models:
+
+- "train": 5 ms steps. The soles touch the floor. Capsules keep the limbs and the trunk apart.
+- "high", for evaluation: 1 ms steps, elliptic cones, a converged solver, collision of all parts,
+  joint friction and damping.
 """
 
 import functools
@@ -21,20 +23,23 @@ _FLOOR_BIT, _PART_BIT = 1, 2
 _DECOR_GROUP = 1
 """Geom group of shapes that never collide."""
 _BUMPER_GROUP = 5
-"""Geom group of capsules that stand for a part of another shape in training, never drawn."""
+"""Geom group of capsules that replace parts of other shapes in training; never drawn."""
 
 PAIR_MARGIN = 0.012
-"""Distance [m] at which two parts already push each other away in training. Policies go to the very
-limit, and simulators differ; without it they trip at high fidelity (docs/fidelity.md)."""
+"""Distance [m] below which two parts repel each other in training.
+
+A policy uses all of the allowed space, and simulators differ a little. Without this margin policies
+trip at high fidelity (docs/fidelity_physics.md)."""
 
 PAIR_CONTACTS = 9
-"""Contacts of each kind that MJX solves for: the nearest. The soles and the feet have
-9 with friction."""
+"""Contacts of each condim that MJX solves: those with the smallest distance.
+
+All 9 contacts with friction fit: 8 sole spheres on the floor, and 1 pair of feet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Static facts of the robot, read back from the compiled model. [16] is in action order."""
+    """Static facts of the robot, read from the compiled model. [16] is in action order."""
 
     mj_model: mujoco.MjModel
     name: str
@@ -43,22 +48,22 @@ class Robot:
     kd: np.ndarray  # [16] N m s/rad
     effort_limit: np.ndarray  # [16] N m
     speed_limit: np.ndarray  # [16] rad/s
-    joint_inertia: np.ndarray  # [16] kg m^2, of each joint alone at home in the air
+    joint_inertia: np.ndarray  # [16] kg m^2, 1 / diag(M^-1): home pose, no contact
     joint_lower: np.ndarray  # [16] rad
     joint_upper: np.ndarray  # [16] rad
-    default_qpos: np.ndarray  # [23] the home keyframe
+    default_qpos: np.ndarray  # [23] home keyframe
     is_arm: np.ndarray  # [16] bool
     base_body_id: int
     link_body_ids: np.ndarray  # [17] the base, then the link after each joint
-    hand_body_ids: np.ndarray  # the last link of each arm
-    subtree: np.ndarray  # [B, B] 1 where a body (column) is part of a body's subtree (row)
-    foot_geom_ids: np.ndarray  # geoms that meet the floor under the feet
+    hand_body_ids: np.ndarray  # [2] last link of each arm
+    subtree: np.ndarray  # [B, B] 1 if body `column` is in the subtree of body `row`
+    foot_geom_ids: np.ndarray  # sole spheres; at high fidelity also the foot boxes
     torso_box_center: np.ndarray  # [3] m, base frame
     torso_box_half_size: np.ndarray  # [3] m
     total_mass: float  # kg
 
     def sensor(self, name: str) -> slice:
-        """Where the named sensor lies in sensordata; KeyError lists the names."""
+        """Slice of the named sensor in `sensordata`. KeyError lists the known names."""
         slices = _sensor_slices(self)
         if name not in slices:
             raise KeyError(f"no sensor {name!r}; there are {', '.join(slices)}")
@@ -81,13 +86,13 @@ def load(
     iterations: int | None = None,
     ls_iterations: int | None = None,
 ) -> Robot:
-    """Compiles the robot (cached).
+    """Compiles the robot's model and reads its facts (cached).
 
     Args:
       fidelity: "train" or "high".
-      timestep: physics step [s]; the fidelity's own if None.
-      iterations: Newton iterations of the contact solver; the fidelity's own if None.
-      ls_iterations: line-search iterations; the fidelity's own if None.
+      timestep: physics step [s]. None: default of the fidelity.
+      iterations: Newton iterations of the contact solver. None: default of the fidelity.
+      ls_iterations: line-search iterations. None: default of the fidelity.
     """
     spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
     if fidelity == "high":
@@ -101,10 +106,10 @@ def load(
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
-    # A diverged simulation must show as NaN, not restart behind our back.
+    # A diverged simulation must show NaN. MuJoCo's automatic reset would hide it.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    # Torque limits depend on joint speed and are applied in motors.motor_torque. The engine must
-    # not clamp as well: C MuJoCo drops the implicit damping of a saturated actuator, MJX keeps it.
+    # motors.motor_torque applies the torque limits, which depend on joint speed. The engine must
+    # not clamp again: C MuJoCo drops the implicit damping of a saturated actuator, MJX keeps it.
     model.actuator_forcelimited[:] = 0
     joints = model.actuator_trnid[:, 0]
     names = tuple(model.joint(j).name for j in joints)
@@ -136,7 +141,7 @@ def load(
 
 
 def _subtree(model: mujoco.MjModel) -> np.ndarray:
-    """[B, B] float: 1 where the column's body is part of the subtree of the row's body."""
+    """[B, B] float: 1 where the body of the column is in the subtree of the body of the row."""
     subtree = np.eye(model.nbody)
     for body in reversed(range(1, model.nbody)):  # children come after their parents
         subtree[model.body_parentid[body]] += subtree[body]
@@ -144,6 +149,11 @@ def _subtree(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
+    """[16] kg m^2, 1 / diag(M^-1) at the home pose without contact.
+
+    It is the torque on one joint over its acceleration, while all other joints and the base are
+    free to move.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
     mujoco.mj_forward(model, data)
@@ -164,7 +174,7 @@ def _raise_fidelity(spec: mujoco.MjSpec) -> None:
     sole = next(g for g in spec.geoms if g.priority > 0)
     friction, priority = sole.friction.copy(), sole.priority
     for geom in spec.geoms:
-        if geom.priority > 0:  # the foot boxes take the place of the sole spheres
+        if geom.priority > 0:  # the foot boxes replace the sole spheres
             geom.contype = 0
         elif geom.parent.name != "world" and geom.group != _DECOR_GROUP:
             geom.contype, geom.conaffinity = _FLOOR_BIT | _PART_BIT, _PART_BIT
@@ -173,16 +183,16 @@ def _raise_fidelity(spec: mujoco.MjSpec) -> None:
 
 
 def _keep_parts_apart(spec: mujoco.MjSpec) -> None:
-    """Adds a contact pair for every two parts that can meet at high fidelity, in place.
+    """Adds contact pairs between parts that can touch at high fidelity, in place.
 
-    One capsule stands for each part. Parts of different limbs meet, and those of a limb meet the
-    trunk; neighbours do not, as at high fidelity. The feet rub, because feet that brush past each
-    other trip by friction. All other pairs are smooth: such a contact costs the solver one row
-    instead of four.
+    One capsule represents each part. Parts of different limbs can touch, and parts of a limb can
+    touch the trunk. Neighbours cannot, as at high fidelity. Only the pair of feet has friction,
+    because friction between the feet makes the robot trip. All other pairs are frictionless: such a
+    contact costs the solver one row instead of four.
     """
     capsules = [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
     parts = sorted((g for g in capsules if g.group != _DECOR_GROUP), key=lambda g: g.group)
-    shapes = {g.parent.name: g for g in parts}  # a bumper comes last and takes the part's place
+    shapes = {g.parent.name: g for g in parts}  # a bumper comes last and replaces the part
     feet = {g.parent.name for g in spec.geoms if g.priority > 0}
     neighbours = {frozenset((e.bodyname1, e.bodyname2)) for e in spec.excludes}
     for (name, a), (other, b) in itertools.combinations(shapes.items(), 2):
@@ -199,7 +209,7 @@ def _keep_parts_apart(spec: mujoco.MjSpec) -> None:
 
 
 def _limb(body: mujoco.MjsBody) -> str:
-    """Name of the first body of the limb that `body` belongs to; the trunk's own for the trunk."""
+    """Name of the first body of the limb that `body` belongs to; for the trunk, its own name."""
     while body.parent.name != "world" and body.parent.parent.name != "world":
         body = body.parent
     return body.name
@@ -208,7 +218,7 @@ def _limb(body: mujoco.MjsBody) -> str:
 def mirror_joints() -> tuple[np.ndarray, np.ndarray]:
     """(permutation [16], sign [16]): q[permutation] * sign is the left-right mirrored joint vector.
 
-    With this robot's axes, mirroring swaps the sides and negates every joint.
+    This robot's joint axes are such that mirroring swaps the sides and negates every joint.
     """
     names = load().joint_names
     swap = {"left": "right", "right": "left"}

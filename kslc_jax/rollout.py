@@ -1,6 +1,6 @@
-"""One rollout: T control steps of N environments under the sampled policy.
+"""One rollout: T control steps of N environments, with actions sampled from the policy.
 
-Numbers that are not finite are masked here, so that one broken environment costs its own sample.
+It masks steps with non-finite numbers. So one broken environment loses only its own samples.
 """
 
 import functools
@@ -20,15 +20,15 @@ from kslc_jax.physics import PhysicsState
 
 @flax.struct.dataclass
 class Trajectory:
-    """One rollout, [T, N, ...]. Frames are stored once; windows are gathered at update time."""
+    """One rollout, [T, N, ...]. Each frame is stored once; the update gathers windows of them."""
 
     action: jax.Array  # [T, N, 16]
     mean: jax.Array  # [T, N, 16]
     log_prob: jax.Array  # [T, N]
     value: jax.Array  # [T, N]
-    age: jax.Array  # [T, N] int, control steps since the reset
-    frame: jax.Array  # [T, N, 59] newest actor frame at each step
-    privileged: jax.Array  # [T, N, 89] newest critic frame
+    age: jax.Array  # [T, N] int, control steps since the reset, before the step
+    frame: jax.Array  # [T, N, 59] newest actor frame, before the step
+    privileged: jax.Array  # [T, N, 89] newest critic frame, before the step
     outcome: Outcome  # [T, N]
 
 
@@ -40,7 +40,7 @@ def collect(
     key: jax.Array,
     simulate: Callable[..., PhysicsState] = physics.step,
 ) -> tuple[EnvState, Trajectory]:
-    """T control steps of N environments under the sampled policy; `simulate` as in `env.step`."""
+    """Runs T control steps of N environments. Masks broken steps. `simulate` as in `env.step`."""
 
     def one(envs: EnvState, key: jax.Array) -> tuple[EnvState, Trajectory]:
         new, traj = control_step(config, params, envs, curriculum, key, simulate)
@@ -58,7 +58,7 @@ def control_step(
     key: jax.Array,
     simulate: Callable[..., PhysicsState] = physics.step,
 ) -> tuple[EnvState, Trajectory]:
-    """One control step of N environments, as it comes out: a row of the trajectory, [N]."""
+    """One control step of N environments, unmasked. The trajectory is one row, [N, ...]."""
     key_act, key_env = jax.random.split(key)
     dist = networks.policy(config, params, envs.history)
     action = dist.sample(key_act)
@@ -78,30 +78,33 @@ def control_step(
 
 
 def finite(tree: object) -> jax.Array:
-    """[] bool: no number of the tree is NaN or infinite."""
+    """[] bool, True if no float in the tree is NaN or infinite."""
     leaves = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
     flags = jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]).astype(jnp.float32)
-    # A dot product, which XLA computes once: it would fuse a chain of ands into the select of every
-    # leaf that depends on it, for twice the instructions and twice the time to compile.
+    # XLA computes a dot product once. It would fuse a chain of ands into the select of each leaf
+    # that depends on it: twice the instructions and twice the compile time.
     return jnp.dot(flags, jnp.ones_like(flags)) == len(leaves)
 
 
 def broken_state(state: EnvState) -> EnvState:
-    """A state without a number in it, whose physics is sure to break: `env.step` makes of it a new
-    episode."""
+    """A state of zeros with NaN velocities. The next `env.step` finds the physics broken, and so
+    starts a new episode."""
     blank = jax.tree.map(jnp.zeros_like, state)
     physics = blank.physics.replace(qvel=jnp.full_like(blank.physics.qvel, jnp.nan))
     return blank.replace(physics=physics)
 
 
 def or_new_episode(state: EnvState) -> EnvState:
-    """The state of ONE environment, or a blank where a number in it is not finite."""
+    """The state of ONE environment, or `broken_state` if a number in it is not finite."""
     return maths.tree_where(finite(state), state, broken_state(state))
 
 
 def mask_broken(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
-    """What a step of ONE environment gave. Where any number is not finite the step counts as
-    broken: it is worth nothing, and a new episode follows."""
+    """Masks a step of ONE environment if a number in it is not finite, or if it is broken already.
+
+    The masked outcome is all zero, except that `terminated` and `broken` are True. A new episode
+    follows.
+    """
     whole = finite(state)
     broken = out.broken | ~whole | ~finite(out)
     lost = ~whole | (broken & ~(out.terminated | out.truncated))
@@ -116,10 +119,13 @@ def mask_broken(state: EnvState, out: Outcome) -> tuple[EnvState, Outcome]:
 def windows(
     history: jax.Array, frame: jax.Array, age: jax.Array
 ) -> Callable[[jax.Array], jax.Array]:
-    """Gathers the histories [B, K, W] that were seen at flat indices t * N + n.
+    """Returns a function that gathers the histories [B, K, W] at flat indices t * N + n [B].
 
-    Frames [T, N, W] are kept once, behind those of the `history` [N, K, W] at the start; what is
-    older than the episode is zero, as after a reset.
+    Args:
+      history: [N, K, W] histories at the start of the rollout.
+      frame: [T, N, W] newest frame before each step.
+      age: [T, N] control steps since the reset. Frames older than the episode become zero, as after
+        a reset.
     """
     num_envs, frames, _ = history.shape
     before = jnp.swapaxes(history[:, :-1], 0, 1)

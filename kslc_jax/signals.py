@@ -1,7 +1,7 @@
-"""PhysicsState -> Signals: every physical quantity that anyone reads, by name.
+"""PhysicsState -> Signals: all physical quantities that other modules read, by name.
 
-Training, evaluation, sim-to-sim and export share this file: whichever engine filled the state, the
-same code reads it.
+Training, evaluation, sim-to-sim and export share this file. The same code reads the state of every
+engine.
 """
 
 import flax.struct
@@ -27,19 +27,19 @@ class Signals:
     base_euler: jax.Array  # [3] roll, pitch, yaw [rad]
     base_linvel: jax.Array  # [3] m/s, base frame
     base_angvel: jax.Array  # [3] rad/s, base frame
-    base_velocity: jax.Array  # [6] linear and angular, world
+    base_velocity: jax.Array  # [6] linear [m/s] and angular [rad/s], world
     gravity: jax.Array  # [3] unit vector of gravity, base frame
     foot_pos: jax.Array  # [2, 3] m, world, ankle-roll link
     foot_vel: jax.Array  # [2, 3] m/s, world
     knee_pos: jax.Array  # [2, 3] m, world
-    foot_force: jax.Array  # [2] N, normal
+    foot_force: jax.Array  # [2] N, sum of the normal forces
     foot_contact: jax.Array  # [2] bool
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world (paper, Eq. 3)
     torso_contact: jax.Array  # [] bool: the 0.4 m box around the torso touches the ground (HG)
 
 
 def read(robot: Robot, state: PhysicsState) -> Signals:
-    """All signals of one environment."""
+    """Reads all signals of one environment."""
     quat = state.qpos[3:7]
 
     def sensor(name: str) -> jax.Array:

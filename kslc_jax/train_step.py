@@ -1,7 +1,7 @@
 """Rollout -> GAE -> PPO update -> curriculum: ONE pure function of ONE state.
 
-`TrainState` is all a training is: saving it and going on from it is the same as not having
-stopped, bit for bit.
+`TrainState` is the whole state of a training. A training that resumes from a saved `TrainState` is
+equal, bit for bit, to one that never stopped.
 """
 
 import dataclasses
@@ -22,35 +22,39 @@ from kslc_jax.ppo import Learner, RolloutConstants, Samples
 from kslc_jax.rollout import Trajectory, collect, finite, or_new_episode, windows
 
 _VELOCITY = observations.slices(observations.CRITIC)["base_linvel"]
-"""Where the critic's frame has what an estimator learns."""
+"""Slice of the base velocity, the estimator's target, in the critic's frame."""
 
 Metrics = dict[str, jax.Array]
 ShardIndex = Callable[[jax.Array], jax.Array]
+"""Places the indices [B] of a minibatch on the devices; without effect on their values."""
 
 
 @flax.struct.dataclass
 class TrainState:
-    """Everything a training depends on."""
+    """Whole state of a training between two train steps."""
 
     learner: Learner
     env: EnvState  # [N, ...]
     curriculum: Curriculum
-    key: jax.Array  # [] typed PRNG key, never advanced: steps fold their number in
+    key: jax.Array  # [] typed PRNG key, constant: each train step folds in its number
     step: jax.Array  # [] int, train steps done
 
 
 def make(
     config: Config,
 ) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
-    """(init, train_step), both jitted; train_step donates its argument.
+    """(init, train_step), both jitted. train_step donates its argument.
 
-    A process compiles a config once: its seed and how long it runs change nothing."""
+    A process compiles each config once. `config.seed` and `config.run` cause no new compilation.
+    """
     init_jit, step_jit = _jitted(dataclasses.replace(config, seed=0, run=RunConfig()))
     return lambda: init_jit(config.seed), step_jit
 
 
 @functools.lru_cache(maxsize=8)
 def _jitted(config: Config):
+    """(init of a seed, train_step), jitted and cached."""
+
     def train_step(state: TrainState) -> tuple[TrainState, Metrics]:
         return step(config, state)
 
@@ -58,8 +62,11 @@ def _jitted(config: Config):
 
 
 def init(config: Config, seed: int | jax.Array) -> TrainState:
-    """The state before the first train step. Its episodes have random ages, so that their ends are
-    spread evenly from the start; the lengths that they are said to have had include those."""
+    """State before the first train step.
+
+    Each first episode starts at a random age, so that time limits are spread evenly from the start.
+    `Outcome.episode_steps` includes this age.
+    """
     key, key_params, key_env, key_time = jax.random.split(jax.random.key(seed), 4)
     curriculum = curriculum_lib.init(config)
     env_keys = jax.random.split(key_env, config.env.num_envs)
@@ -77,11 +84,14 @@ def init(config: Config, seed: int | jax.Array) -> TrainState:
 def start_from(
     config: Config, state: TrainState, params: Params, curriculum: Curriculum
 ) -> TrainState:
-    """An initial state with the networks of another training, and as far as its curriculum had
-    got; ValueError where the networks have other shapes."""
+    """Replaces networks and curriculum of an initial `state` by those of another training.
+
+    The curriculum is clipped to the config's limits, see `curriculum.inherit`. ValueError if the
+    networks have other shapes.
+    """
     if jax.tree.map(jnp.shape, params) != jax.tree.map(jnp.shape, state.learner.params):
         raise ValueError("networks of other shapes")
-    # Copies, for a train step donates its state and another training may start from the same.
+    # Copies: a train step donates its state, and another training may start from these arrays.
     params = jax.tree.map(jnp.copy, params)
     average = jax.tree.map(jnp.copy, ppo.acting(params))
     learner = state.learner.replace(params=params, average=average)
@@ -93,8 +103,10 @@ def start_from(
 def step(
     config: Config, state: TrainState, shard_index: ShardIndex = lambda index: index
 ) -> tuple[TrainState, Metrics]:
-    """One rollout and one update; see the module's first line. `shard_index` places the indices of
-    a minibatch's samples where there are several devices."""
+    """One rollout and one update, see the module docstring.
+
+    `shard_index` places the indices of a minibatch on several devices.
+    """
     key_roll, key_update = step_keys(state)
     params = state.learner.params
     start = jax.vmap(or_new_episode)(state.env)
@@ -112,10 +124,11 @@ def step(
 
 
 def rollout_constants(config: Config, state: TrainState) -> RolloutConstants:
-    """What the samples of the coming rollout share.
+    """Values that are constant during the next rollout.
 
-    With `ppo.entropy_fades` the entropy bonus falls with what is left to climb: a policy that is
-    paid for its noise until the end has learnt to act with it, and is biased without.
+    With `ppo.entropy_fades` the entropy bonus is proportional to the remaining share of the
+    curriculum. A policy that is paid for noise until the end learns to rely on it; without noise it
+    is then biased.
     """
     coef = jnp.asarray(config.ppo.entropy_coef, jnp.float32)
     if config.ppo.entropy_fades:
@@ -124,12 +137,12 @@ def rollout_constants(config: Config, state: TrainState) -> RolloutConstants:
 
 
 def step_keys(state: TrainState) -> jax.Array:
-    """[2] keys of one train step: of the rollout and of the update."""
+    """[2] keys of one train step: for the rollout and for the update."""
     return jax.random.split(jax.random.fold_in(state.key, state.step))
 
 
 def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
-    """Flattened PPO samples [T * N, ...] with advantages."""
+    """PPO samples [T * N, ...] of a trajectory, with advantages; `last_value` is [N]."""
     out = traj.outcome
     done = out.terminated | out.truncated
     advantage, target = jax.vmap(ppo.gae, (1, 1, 0, 1, 1, None, None), 1)(
@@ -151,7 +164,10 @@ def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Sampl
 def _observer(
     config: Config, start: EnvState, traj: Trajectory, shard_index: ShardIndex = lambda index: index
 ) -> ppo.PolicyAtIndex:
-    """The networks at the observations of `traj`, named by their flat index t * N + n."""
+    """Function that evaluates the networks at observations of `traj`, given by index t * N + n.
+
+    `start` holds the environments before the rollout.
+    """
     actor = windows(start.history, traj.frame, traj.age)
     critic = windows(start.privileged_history, traj.privileged, traj.age)
 
@@ -168,7 +184,7 @@ def _observer(
 
 
 def _progress(config: Config, out: Outcome) -> Progress:
-    """What the rollout says about the policy, for the curriculum; broken steps say nothing."""
+    """Statistics of the rollout for the curriculum. Broken steps do not count."""
     done = out.terminated | out.truncated
 
     def mean_over(value: jax.Array, mask: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -201,8 +217,11 @@ def _progress(config: Config, out: Outcome) -> Progress:
 def _metrics(
     config: Config, state: TrainState, out: Outcome, progress: Progress, losses: Metrics
 ) -> Metrics:
-    """Scalars of one train step. `reward/...` are raw terms, before weights; `broken` is the share
-    of samples that were masked, `finite` is 1 while networks, optimiser and curriculum are."""
+    """Scalars of one train step.
+
+    `reward/...` are unweighted terms. `broken` is the share of masked samples. `finite` is 1 if all
+    numbers of the learner and the curriculum are finite, else 0.
+    """
     terms = {f"reward/{name}": jnp.mean(value) for name, value in out.terms.items()}
     return {
         "step": state.step,

@@ -1,11 +1,11 @@
-"""Every number that a user may change, as frozen, checked dataclasses, and the named presets.
+"""All settings that a user may change: frozen, checked dataclasses, and the named presets.
 
-Imports no JAX: a config can be read, checked and printed before anything heavy starts.
-`rewards.weights` holds one field per reward term of `kslc_jax.rewards.TERMS`.
+It imports no JAX, so a program can read, check and print a config before JAX starts.
+`rewards.weights` has one field per reward term of `kslc_jax.rewards.TERMS`.
 
-Sources: "paper" is Zhang et al., KSLC (Tables I and II, Eq. 2 to 10); "HG" is Humanoid-Gym, which
-the paper builds on and which settles what the paper leaves open. Each departure is explained in
-docs/fidelity.md.
+Sources: "paper" is Zhang et al., KSLC (Tables I and II, Eq. 2 to 10). "HG" is Humanoid-Gym: the
+paper builds on it, and it decides what the paper leaves open. docs/fidelity.md explains each
+departure from them.
 """
 
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset

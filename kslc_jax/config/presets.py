@@ -1,4 +1,4 @@
-"""Named configs, and the paper's ablations as changes to any of them."""
+"""Named configs, and the paper's ablations, which can change any of them."""
 
 import dataclasses
 import difflib
@@ -8,7 +8,7 @@ from kslc_jax.config.schema import Config, ConfigError
 
 
 def _override(config: Any, **changes: Any) -> Any:
-    """`dataclasses.replace`, where a dict value replaces fields of a nested config."""
+    """Like `dataclasses.replace`; a dict replaces fields of a nested config."""
     new = {
         name: _override(getattr(config, name), **value) if isinstance(value, dict) else value
         for name, value in changes.items()
@@ -18,8 +18,8 @@ def _override(config: Any, **changes: Any) -> Any:
 
 _PAPER = Config()
 
-# Humanoid-Gym as the paper compares against: fixed rewards, arms held, no KSLC terms, fixed cycle,
-# commands up to the paper's top speed from the start.
+# Humanoid-Gym as the paper's baseline: fixed rewards, held arms, no KSLC terms, a fixed gait cycle,
+# and commands up to the paper's top speed from the start.
 _BASELINE = _override(
     _PAPER,
     env={"arms": "held"},
@@ -27,7 +27,7 @@ _BASELINE = _override(
     curriculum={"velocity": False, "cycle": False, "v_start": 3.5},
 )
 
-# Learns fast on two CPU cores. What it changes and why: docs/laptop_recipe.md.
+# Learns fast on two CPU cores. docs/laptop_recipe.md explains each change.
 _LAPTOP_LEARNER: dict[str, Any] = {
     "env": {"num_envs": 2048, "frames": 5},
     "network": {
@@ -134,8 +134,9 @@ PRESETS: dict[str, Config] = {
     "baseline-laptop": _override(_BASELINE, **_LAPTOP_LEARNER),
 }
 
-# The paper's ablations: one switch each, on any preset. Held arms also leave the gait's reference:
-# they cannot follow it, and the norm of Eq. 8 would pay the legs nothing for following theirs.
+# The paper's ablations: one switch each, for any preset. With held arms the gait's reference must
+# not move the arms. They could not follow it, and their error in the norm of Eq. 8 would take most
+# of the reward from legs that follow their reference.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "arms": {
         "env": {"arms": "held"},
@@ -149,6 +150,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 
 
 def _lookup(kind: str, name: str, table: dict[str, Any]) -> Any:
+    """The named entry; ConfigError with the closest known name if there is none."""
     if name in table:
         return table[name]
     close = difflib.get_close_matches(name, table, n=1)

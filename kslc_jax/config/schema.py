@@ -1,4 +1,4 @@
-"""The config's schema: frozen dataclasses with checks; what follows from a value is a property."""
+"""Schema of the config: frozen dataclasses with checks. Derived values are properties."""
 
 from __future__ import annotations
 
@@ -16,24 +16,26 @@ Fidelity = Literal["train", "high"]
 
 
 class ConfigError(UserError):
-    """A config value that cannot work; the message names the field and the fix."""
+    """A config value cannot work. The message names the field and says what is allowed."""
 
 
 def require(ok: bool, message: str) -> None:
+    """Raises ConfigError with `message` if not `ok`."""
     if not ok:
         raise ConfigError(message)
 
 
 COUNTER = 2**31
-"""Steps, samples and seeds are 32-bit integers in the compiled train step."""
+"""Upper limit of steps, samples and seeds: the train step counts in 32-bit integers."""
 
 
 def require_seed(seed: int, name: str = "seed") -> None:
-    require(0 <= seed < COUNTER, f"{name} must not be negative, nor above 2^31")
+    """Raises ConfigError if `seed` does not lie in [0, 2^31)."""
+    require(0 <= seed < COUNTER, f"{name} must lie in [0, 2^31), not {seed}")
 
 
 def _check_numbers(name: str, value: object) -> None:
-    """Every number is finite, and every integer one that a shape can hold."""
+    """Raises ConfigError for numbers that are not finite, or too large for an array shape."""
     if dataclasses.is_dataclass(value):
         for f in dataclasses.fields(value):
             _check_numbers(f"{name}.{f.name}".lstrip("."), getattr(value, f.name))
@@ -41,10 +43,11 @@ def _check_numbers(name: str, value: object) -> None:
         for part in value:
             _check_numbers(name, part)
     elif isinstance(value, int | float):
-        require(abs(value) < 2**62, f"{name}: {value} is out of bounds")
+        require(abs(value) < 2**62, f"{name}: {value} is too large or not finite")
 
 
 def _check_range(name: str, value: Range) -> None:
+    """Raises ConfigError if the lower bound is above the upper one."""
     require(value[0] <= value[1], f"{name}: lower bound {value[0]} is above upper bound {value[1]}")
 
 
@@ -55,18 +58,18 @@ class PhysicsConfig:
     fidelity: ClassVar[Fidelity] = "train"
 
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
-    """mjx: pure XLA, any device. mujoco: C MuJoCo on all CPU cores behind one callback, faster on
-    a CPU (docs/performance.md). auto: mjx on an accelerator, mujoco without one."""
+    """mjx: pure XLA, any device. mujoco: C MuJoCo on the CPU cores, called back from JAX; faster on
+    a CPU (docs/performance.md). auto: mjx if JAX has an accelerator, else mujoco."""
     timestep: float = 0.005
-    """Physics step [s]; the PD torque is recomputed at each one."""
+    """Physics step [s]. The PD torque is recomputed at each one."""
     decimation: int = 2
     """Physics steps per control step."""
     iterations: int = 4
-    """Newton iterations of the contact solver; below 4 contact explodes on this robot."""
+    """Newton iterations of the contact solver. With fewer than 4 this robot's contacts explode."""
     ls_iterations: int = 5
     """Line-search iterations of the contact solver."""
     threads: int = 0
-    """CPU threads of the mujoco engine; 0 takes all cores. Does not change results."""
+    """CPU threads of the mujoco engine; 0: all cores. Does not change results."""
 
     def __post_init__(self):
         require(self.timestep > 0, "physics.timestep must be positive")
@@ -83,7 +86,7 @@ class PhysicsConfig:
 
 @dataclass(frozen=True)
 class HighFidelity(PhysicsConfig):
-    """Evaluation in full C MuJoCo: 1 ms, converged solver, and what robot.load("high") adds."""
+    """Physics of evaluation: C MuJoCo, 1 ms, converged solver, model of robot.load("high")."""
 
     fidelity: ClassVar[Fidelity] = "high"
 
@@ -103,24 +106,28 @@ class EnvConfig:
     """Actions, observations and episodes."""
 
     num_envs: int = 4096
+    """Robots that are simulated in parallel (paper, Table I)."""
     episode_seconds: float = 24.0
+    """Time limit of an episode [s] (HG)."""
     action_scale: float = 0.25
     """Joint target [rad] = default + scale * action (HG)."""
     action_clip: float = 18.0
+    """Actions are clipped to [-x, x] (HG)."""
     observation_clip: float = 18.0
+    """Observations are clipped to [-x, x] (HG)."""
     action_delay: float = 0.5
-    """Largest share of the previous action mixed into this one (HG)."""
+    """Largest share of the previous action that is mixed into the present one (HG)."""
     action_noise: float = 0.02
-    """Multiplicative action noise (HG)."""
+    """Relative standard deviation of multiplicative action noise (HG)."""
     noise_level: float = 0.6
-    """Scales all observation noise (HG); 0 switches it off."""
+    """Factor on all observation noise (HG); 0: no noise."""
     frames: int = 15
     """Frames of actor history (paper, Table I)."""
     privileged_frames: int = 3
     """Frames of critic history (paper, Table I)."""
     arms: Literal["free", "held"] = "free"
-    """held: arm actions are ignored and the arms servo to zero (ablation, baseline); the gait's
-    reference must then not move them."""
+    """free: the policy moves the arms. held: arm actions are ignored and servos keep the arms at
+    zero (ablation, baseline). The gait's reference must then not move the arms."""
     reset_joint_noise: float = 0.1
     """Initial joint angles are default + U(-x, x) [rad] (HG)."""
 
@@ -138,34 +145,41 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class CommandConfig:
-    """Sampling of commanded velocity and heading. The range of vx is the curriculum's."""
+    """Sampling of commanded velocity and heading. The curriculum sets the range of vx."""
 
     vy: Range = (-0.3, 0.3)
+    """Range of the commanded sideways velocity [m/s]."""
     heading: Range = (-3.14, 3.14)
+    """Range of the commanded heading [rad], world frame."""
     resample_seconds: float = 8.0
-    """A command holds this long at most."""
+    """Longest time [s] that a command holds."""
     shortest_seconds: float = 0.0
-    """A command holds this long at least, drawn uniformly; 0: always `resample_seconds` (HG)."""
+    """Shortest time [s] that a command holds. The time is uniform from here to `resample_seconds`.
+    0: always `resample_seconds` (HG)."""
     dead_zone: float = 0.2
-    """Commands whose planar norm is at most this become zero [m/s] (HG)."""
+    """Commanded vx and vy become zero if their norm [m/s] is at most this (HG)."""
     heading_gain: float = 0.5
+    """Commanded yaw rate per heading error [1/s] (HG)."""
     max_yaw_rate: float = 1.0
+    """Largest commanded yaw rate [rad/s] (HG)."""
     stand_fraction: float = 0.0
-    """Share of commands that are 'stand still'."""
+    """Share of commands with zero velocity."""
     forward_fraction: float = 0.0
-    """Share of commands that are straight ahead (no vy, heading as it is)."""
+    """Share of commands straight ahead: vy is 0 and the heading stays."""
     slow_fraction: float = 0.0
-    """Share of commands whose vx is drawn up to `slow_speed` only: in a wide range slow commands
-    are rare."""
+    """Share of commands with vx up to `slow_speed` only. Slow commands are rare in a wide range
+    otherwise."""
     slow_speed: float = 1.0
-    """Fastest of those [m/s]."""
+    """Largest vx [m/s] of the `slow_fraction`."""
     top_fraction: float = 0.0
-    """Share of commands whose vx is drawn from the top `curriculum.v_step` of the range. Stops from
-    the top speed and starts to it are rare otherwise."""
+    """Share of commands with vx from the top `curriculum.v_step` of the range. Changes from and to
+    the top speed are rare otherwise."""
     narrow_speed: float = 0.0
-    """Forward speed [m/s] at which vy and heading changes have shrunk to nothing; 0: never."""
+    """vy and heading changes shrink linearly with |vx| and are 0 from this speed [m/s] on. 0: they
+    never shrink."""
     stand_still: bool = False
-    """A zero command hides the gait clock and asks for both feet on the ground (HG marches)."""
+    """True: a zero command means "stand": the gait clock is off, and both feet should be on the
+    ground. False: the robot marches in place (HG)."""
 
     def __post_init__(self):
         _check_range("command.vy", self.vy)
@@ -189,39 +203,40 @@ class CommandConfig:
 
 @dataclass(frozen=True)
 class GaitConfig:
-    """Gait clock and reference motion."""
+    """Gait clock and reference motion of the joints."""
 
     cycle_time: float = 0.64
-    """Seconds per gait cycle at the start of the curriculum (HG)."""
+    """Gait cycle [s] at the start of the curriculum (HG)."""
     double_support: float = 0.1
-    """Both feet stand where abs(sin(phase)) is below this (HG)."""
+    """The clock wants both feet on the ground while abs(sin(phase)) is below this (HG)."""
     double_support_at_speed: float = 0.1
-    """What `double_support` turns into at `full_speed`, with the square of the speed. Below zero it
-    is flight: no foot stands where abs(sin(phase)) is below its size."""
+    """Value of `double_support` at `full_speed`. It changes with the square of the speed. Negative
+    values mean flight: the clock wants no foot on the ground while abs(sin(phase)) is below their
+    size."""
     reference_scale: float = 0.17
-    """Amplitude of the hip and ankle reference [rad]; the knee's is twice that (HG)."""
+    """Amplitude of the hip and ankle reference [rad]. The knee's is twice as large (HG)."""
     reference_speed_gain: float = 0.0
-    """Relative growth of the leg reference at `full_speed` (paper, Eq. 8: longer strides)."""
+    """Relative growth of `reference_scale` from speed 0 to `full_speed` (longer strides, Eq. 8)."""
     full_speed: float = 3.5
-    """Commanded speed [m/s] at which speed-dependent references are fully grown."""
+    """Commanded speed [m/s] from which speed-dependent settings have their full size."""
     stride_sweep: float = 0.0
-    """Hip reference amplitude [rad] at `full_speed`: the leg lands in front of the body and leaves
-    the ground behind it."""
+    """Amplitude [rad] at `full_speed` of a hip reference with which the leg lands in front of the
+    body and leaves the ground behind it."""
     arm_swing: float = 0.0
-    """Shoulder reference amplitude [rad] at `full_speed`, against the same side's leg."""
+    """Amplitude [rad] of the shoulder reference at `full_speed`, opposite to its side's leg."""
     arm_swing_slow: float = 0.0
-    """The same at the slowest walk."""
+    """Amplitude [rad] of the shoulder reference at commanded speed 0."""
     elbow_bend: float = 0.0
-    """Elbow flexion reference [rad] at `full_speed`."""
+    """Elbow flexion [rad] of the reference at `full_speed`."""
     cycle_follows_speed: bool = False
-    """True: slow commands keep `cycle_time`, only the fastest use the curriculum's. The cycle of a
-    command then changes whenever the range grows."""
+    """True: the cycle falls linearly with speed, from `cycle_time` at 0 to the curriculum's cycle
+    at v_max. The cycle of a command then changes whenever the range grows."""
     cycle_from_speed: float = 0.0
-    """Above 0: a command's cycle depends on its speed alone. Up to this speed [m/s] it is
-    `cycle_time`; from there each `curriculum.v_step` shortens it by `curriculum.cycle_factor`, as
-    the curriculum does (Eq. 10), and never below the curriculum's cycle."""
+    """Above 0: the cycle of a command depends on its speed only. Up to this speed [m/s] it is
+    `cycle_time`. Each further `curriculum.v_step` multiplies it by `curriculum.cycle_factor`, as
+    the curriculum does (Eq. 10). It is never shorter than the curriculum's cycle."""
     random_phase: bool = False
-    """Episodes start at a random gait phase (HG: phase 0)."""
+    """True: episodes start at a random gait phase. False: at phase 0 (HG)."""
 
     def __post_init__(self):
         require(self.cycle_time > 0, "gait.cycle_time must be positive")
@@ -235,15 +250,16 @@ class GaitConfig:
 
 @dataclass(frozen=True)
 class RandomizeConfig:
-    """Domain randomisation, sampled anew every episode. A range of one value is 'off'."""
+    """Domain randomisation, sampled at every reset. Two equal bounds mean a constant."""
 
     friction: Range = (0.1, 2.0)
-    """Foot friction; averaged with the ground's as PhysX does (HG)."""
+    """Friction of the feet (HG). The contact uses the mean of foot and ground, as in PhysX."""
     ground_friction: float = 0.6
+    """Friction of the ground (HG)."""
     base_mass: Range = (-5.0, 5.0)
-    """Added to the base link [kg] (HG)."""
+    """Mass added to the base link [kg] (HG)."""
     base_com: Range = (0.0, 0.0)
-    """Shift of the base link's centre of mass, each axis [m]."""
+    """Shift of the base link's centre of mass, per axis [m]."""
     kp: Range = (1.0, 1.0)
     """Factor on the position gains, per joint."""
     kd: Range = (1.0, 1.0)
@@ -251,31 +267,34 @@ class RandomizeConfig:
     motor_strength: Range = (1.0, 1.0)
     """Factor on the available torque, per joint."""
     joint_friction: Range = (0.0, 0.0)
-    """Coulomb friction of the joints [N m]."""
+    """Coulomb friction [N m], per joint."""
     link_mass: Range = (1.0, 1.0)
-    """Factor on the mass and inertia of each link."""
+    """Factor on mass and inertia, per link."""
     link_com: Range = (0.0, 0.0)
-    """Shift of each link's centre of mass, each axis [m]."""
+    """Shift of each link's centre of mass, per axis [m]."""
     hand_mass: Range = (0.0, 0.0)
-    """Added to the last link of each arm, at its centre of mass [kg]."""
+    """Mass added to the last link of each arm, at its centre of mass [kg]."""
     noise: Range = (1.0, 1.0)
-    """Factor on sensor noise, action noise and action delay of an episode."""
+    """Factor on observation noise, action noise and action delay of an episode."""
     push_seconds: float = 4.0
-    """Time between pushes; 0: none (HG)."""
+    """Time between pushes [s] (HG); 0: no pushes."""
     push_velocity: float = 0.2
-    """Largest push, x and y [m/s] (HG)."""
+    """Largest push [m/s], along x and y each (HG)."""
     push_angular: float = 0.4
-    """Largest push, each axis [rad/s] (HG)."""
+    """Largest push [rad/s], about each axis (HG)."""
     push_adds: bool = True
-    """True adds the push to the base's velocity; False sets the velocity to it, as HG does, which
-    at 3.5 m/s is running into a wall."""
+    """True: a push is added to the base's velocity. False: it replaces the velocity (HG). At
+    3.5 m/s a replaced velocity is like a wall, not like a push."""
 
     def __post_init__(self):
         for f in dataclasses.fields(self):
             value = getattr(self, f.name)
             if isinstance(value, tuple):
                 _check_range(f"randomize.{f.name}", value)
-        require(self.base_mass[0] > -20, "randomize.base_mass: the base link has 21 kg to lose")
+        require(
+            self.base_mass[0] > -20,
+            "randomize.base_mass must be above -20: the base link weighs 21 kg",
+        )
         for name in (
             "kp",
             "kd",
@@ -291,14 +310,14 @@ class RandomizeConfig:
 
 @dataclass(frozen=True)
 class RewardWeights:
-    """Weight of each reward term; every one is multiplied by the control step (HG)."""
+    """Weight of each reward term. The weighted sum is multiplied by the control step [s] (HG)."""
 
-    # Paper: Eq. 5 to 8 (alpha_p, alpha_f, alpha_b are HG's weights of the same terms), Eq. 4.
+    # Term of the paper (Eq. 4 to 8), see kslc_jax/rewards.py. The weights of Eq. 5 equal HG's.
     joint_pos: float = 1.6
     feet_clearance: float = 1.0
     base_height: float = 0.2
     angular_momentum: float = 0.05
-    # General rewards (HG).
+    # Term of HG, see kslc_jax/rewards.py.
     feet_contact_number: float = 1.2
     feet_air_time: float = 1.0
     foot_slip: float = -0.05
@@ -318,7 +337,7 @@ class RewardWeights:
     dof_vel: float = -5e-4
     dof_acc: float = -1e-7
     collision: float = -1.0
-    # Ours, off in the paper's presets.
+    # Our own term, off in the presets `paper` and `baseline`, see kslc_jax/rewards.py.
     tracking_mean_vel: float = 0.0
     dof_vel_limits: float = 0.0
     stand_still: float = 0.0
@@ -326,56 +345,59 @@ class RewardWeights:
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """Parameters of the reward terms; weights in `weights`."""
+    """Weights and parameters of the reward terms."""
 
     weights: RewardWeights = RewardWeights()
     only_positive: bool = True
-    """Clip the total at >= 0 (HG)."""
+    """True: the total reward of a step is at least 0 (HG)."""
     velocity_rewards: bool = True
-    """The paper's velocity-related forms (Eq. 6 to 8); False: HG's fixed ones."""
+    """True: the paper's speed-dependent forms (Eq. 6 to 8). False: HG's fixed forms."""
     tracking_sigma: float = 5.0
-    """exp(-sigma * squared error) of the tracking terms (HG)."""
+    """sigma in exp(-sigma * squared error) of the tracking terms (HG)."""
     momentum_scale: float = 5.0
-    """Angular momentum [kg m^2/s] that makes Eq. 4's exponent 1."""
+    """Angular momentum [kg m^2/s] at which the exponent of Eq. 4 is 1."""
     momentum_floor: float = -20.0
-    """c1 of Eq. 4; c2 is 0."""
+    """c1, the lower bound of Eq. 4; c2 is 0."""
     base_height_target: float = 0.89
+    """Target height of the base above the stance feet [m] (HG)."""
     base_height_kernel: float = 100.0
-    """beta^b of Eq. 6."""
+    """beta^b of Eq. 6 [1/m]."""
     base_height_drop: float = 0.05
-    """gamma^b of Eq. 6: relative lowering of the base at the fastest command."""
+    """gamma^b of Eq. 6: relative drop of the target height at the fastest command."""
     clearance_target: float = 0.06
-    """Target height of the swing foot [m] (HG)."""
+    """Target height of the swing foot above its last contact [m] (HG)."""
     clearance_speed_gain: float = 1.0
-    """Relative growth of the clearance target at the fastest command (Eq. 7)."""
+    """Relative growth of `clearance_target` at the fastest command (Eq. 7)."""
     clearance_width: float = 0.01
-    """Half width of HG's window, or length scale of Eq. 7's kernel as read [m]."""
+    """Length scale of Eq. 7's kernel, or half width of HG's window [m]."""
     clearance_mid_swing: bool = False
-    """Weighs the swing foot's height with sin^2 of the gait phase (mean over a half cycle: 1), so
-    that it counts in mid-swing and not while the foot leaves the ground or comes down."""
+    """True: weights Eq. 7 with 2 sin^2(phase), whose mean over the swing is 1. The height then
+    counts in mid-swing, not while the foot lifts off or lands."""
     joint_pos_kernel: float = 2.0
-    """-beta^p of Eq. 8."""
+    """-beta^p of Eq. 8 [1/rad]."""
     joint_pos_penalty: float = 0.2
     """gamma^p of Eq. 8."""
     joint_pos_clip: float = 0.5
-    """c2 of Eq. 8; c1 is 0."""
+    """c2, the upper bound in Eq. 8 [rad]; c1 is 0."""
     max_contact_force: float = 700.0
-    """Foot force [N] above which feet_contact_forces counts (HG)."""
+    """Foot force [N] above which `feet_contact_forces` counts (HG)."""
     lateral_distance: bool = False
-    """Feet and knee distance across the heading, not in the plane, so that strides are free."""
+    """True: feet and knee distance are measured across the heading, so that strides do not count.
+    False: in the plane (HG)."""
     feet_distance: Range = (0.2, 0.5)
+    """Allowed distance of the feet [m] (HG)."""
     knee_distance: Range = (0.2, 0.25)
+    """Allowed distance of the knees [m] (HG)."""
     lean_per_speed: float = 0.0
-    """Forward lean [rad per m/s] that `orientation` takes as upright."""
+    """Forward lean per commanded speed [rad per m/s] at which `orientation` is best."""
     exact_from: float = 0.5
-    """Upper end of the commanded range [m/s] up to which `tracking_mean_vel` and `restless` are
-    nothing."""
+    """`tracking_mean_vel` and `restless` are 0 while v_max [m/s] <= exact_from."""
     exact_full: float = 2.5
-    """The same from where on they have their full size."""
+    """`tracking_mean_vel` and `restless` have full size while v_max [m/s] >= exact_full."""
     restless: float = 0.0
-    """How much the squared changes of the action count within `stand_still`, at full size."""
+    """Weight of squared action changes within the term `stand_still`, at full size."""
     speed_limit_margin: float = 0.9
-    """Share of the joint speed limit above which dof_vel_limits counts."""
+    """Share of the joint speed limit above which `dof_vel_limits` counts."""
 
     def __post_init__(self):
         require(self.momentum_scale > 0, "rewards.momentum_scale must be positive")
@@ -389,42 +411,51 @@ class RewardConfig:
 
 @dataclass(frozen=True)
 class CurriculumConfig:
-    """Velocity range (Eq. 9) and gait cycle (Eq. 10), gated on the tracking reward."""
+    """Growth of the velocity range (Eq. 9) and shortening of the gait cycle (Eq. 10)."""
 
     velocity: bool = True
+    """True: the range of commanded vx grows. False: it stays at `v_start`."""
     cycle: bool = True
+    """True: the gait cycle gets shorter. False: it stays at `gait.cycle_time`."""
     v_min: float = -0.3
     """Lower end of the commanded vx [m/s] (HG)."""
     v_start: float = 0.5
+    """First upper end v_max of the commanded vx [m/s]."""
     v_step: float = 0.5
+    """Growth of v_max per change [m/s] (Eq. 9)."""
     v_limit: float = 3.5
+    """Last v_max [m/s]."""
     cycle_factor: float = 0.95
+    """Factor on the gait cycle per change (Eq. 10)."""
     cycle_min: float = 0.48
+    """Shortest gait cycle [s]."""
     threshold: float = 0.8
-    """lambda of Eq. 9 and 10: share of the maximal tracking reward."""
+    """lambda of Eq. 9 and 10: share of the maximal tracking reward that all commands must reach."""
     fast_share: float = 0.6
-    """Commands above this share of v_max are 'fast'."""
+    """Commands above this share of v_max are "fast"."""
     fast_threshold: float = 0.7
-    """Share of the maximal tracking reward that the fast commands must reach."""
+    """Share of the maximal tracking reward that fast commands must reach."""
     min_episode_steps: float = 1000.0
+    """Mean length of episodes [control steps] that must be reached."""
     gait_threshold: float = -1.0
-    """Least mean of the `feet_contact_number` term under fast commands, which is 1 where the feet
-    follow the clock and -0.3 where they do the contrary; -1: any. A shuffle can track, too."""
+    """Mean of the term `feet_contact_number` that fast commands must reach. The term is 1 if both
+    feet follow the clock and -0.3 if none does. A shuffling gait can track speed too; this excludes
+    it. -1: no condition."""
     top_error: float = 1e9
-    """Relative error of the mean speed that commands in the top `v_step` of the range may have, for
-    the range to grow: what cannot be run is not widened. 1e9: any."""
+    """Largest relative error of the mean speed under commands in the top `v_step` of the range. The
+    range does not grow before the robot can run its top speed. 1e9: no condition."""
     top_error_floor: float = 2.0
-    """Commands below this speed [m/s] count as if they were this fast: slow walks need not be as
-    exact before there are faster ones."""
+    """For `top_error`, the error is divided by this speed [m/s] if the command is slower. Slow
+    walking then needs less relative accuracy."""
     top_falls: float = 1e9
-    """Falls per minute that those commands may lead to. 1e9: any."""
+    """Most falls per minute under commands in the top `v_step`. 1e9: no condition."""
     settle_seconds: float = 0.0
-    """Tracking counts from this long after a change of the command: reaching it takes time, and the
-    longer the wider the range is."""
+    """A command is "settled" this long [s] after it changed; only settled commands count for
+    tracking. A robot needs time to reach a new speed, and more in a wider range."""
     smoothing: float = 0.95
-    """Moving averages keep this share per update."""
+    """Share of its old value that a moving average keeps per update."""
     min_updates: int = 40
-    """Updates between two changes."""
+    """Smallest number of updates between two changes."""
 
     def __post_init__(self):
         require(0 < self.cycle_factor <= 1, "curriculum.cycle_factor must lie in (0, 1]")
@@ -442,19 +473,22 @@ class CurriculumConfig:
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Actor and critic: separate ELU networks; state-independent standard deviation (HG)."""
+    """Separate ELU networks for actor and critic; state-independent standard deviation (HG)."""
 
     actor: tuple[int, ...] = (512, 256, 128)
+    """Widths of the actor's hidden layers (HG)."""
     critic: tuple[int, ...] = (768, 256, 128)
+    """Widths of the critic's hidden layers (HG)."""
     init_std: float = 1.0
+    """Initial standard deviation of the actions (HG)."""
     init_mean: float = 1.0
-    """Size of the untrained actor's outputs; near 0 every robot starts by holding its pose."""
+    """Size of the untrained actor's outputs. Near 0 the untrained policy holds the default pose."""
     symmetric: bool = False
-    """Networks that commute with left-right mirroring by construction: a mirrored robot gets the
-    mirrored action and the same value. At equal sizes half the work of free ones."""
+    """True: the networks commute with left-right mirroring. A mirrored robot gets the mirrored
+    action and the same value. They need half the work of free networks of the same size."""
     estimator: tuple[int, ...] = ()
-    """Hidden layers of a network that estimates the base's velocity from the actor's history. The
-    actor reads the estimate beside the history. Empty: none."""
+    """Widths of the hidden layers of a network that estimates the base's velocity from the actor's
+    history. The actor gets the history and the estimate. Empty: no estimator."""
 
     def __post_init__(self):
         sizes = self.actor + self.critic + self.estimator
@@ -468,29 +502,41 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """PPO with asymmetric critic and KL-adaptive learning rate (HG, paper Table I)."""
+    """PPO with asymmetric critic and KL-adaptive learning rate (HG; paper, Table I)."""
 
     rollout_steps: int = 60
+    """Control steps of each robot per update."""
     minibatches: int = 4
+    """Minibatches per epoch."""
     epochs: int = 2
+    """Passes over the samples per update."""
     gamma: float = 0.994
+    """Discount factor."""
     lam: float = 0.9
+    """Lambda of generalised advantage estimation (GAE)."""
     clip: float = 0.2
+    """Clipping of the probability ratio and of the change of the value."""
     value_coef: float = 1.0
+    """Weight of the value loss."""
     estimate_coef: float = 1.0
-    """Weight of the velocity estimate's squared error, with `network.estimator`."""
+    """Weight of the squared error of the velocity estimate, with `network.estimator`."""
     entropy_coef: float = 0.001
+    """Weight of the entropy bonus."""
     entropy_fades: bool = False
-    """True: the entropy bonus falls to nothing on the curriculum's way to `v_limit`."""
+    """True: the entropy bonus falls to 0 while the curriculum goes from `v_start` to `v_limit`."""
     max_grad_norm: float = 1.0
+    """The gradient is scaled down to this global norm."""
     learning_rate: float = 1e-5
-    """Start of the adaptive schedule (Table I); it rises at once."""
+    """Initial value of the adaptive learning rate (Table I). It rises at once."""
     learning_rate_bounds: Range = (1e-5, 1e-2)
+    """Bounds of the adaptive learning rate (HG)."""
     desired_kl: float = 0.01
+    """The learning rate adapts to this KL divergence per minibatch (HG)."""
     average: float = 0.0
-    """The policy that is saved averages the actor's parameters; they keep this share per update.
-    0: the newest parameters."""
+    """The saved policy has a moving average of the acting parameters, which keeps this share per
+    update. 0: the newest parameters."""
     learning_rate_factor: float = 1.5
+    """Factor of one change of the learning rate (HG)."""
 
     def __post_init__(self):
         for name in ("rollout_steps", "minibatches", "epochs"):
@@ -509,17 +555,18 @@ class PPOConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """The host's side of a training: length, logs, checkpoints; changes no number of it."""
+    """Length, logs and checkpoints of a training. They change no number in a train step."""
 
     steps: int = 737_525_760
-    """Environment steps in all (HG: 3001 iterations of 4096 x 60)."""
+    """Environment steps of the whole training (HG: 3001 iterations of 4096 x 60)."""
     log_every: int = 1
     """Train steps per logged record."""
     checkpoint_minutes: float = 5.0
+    """Minutes between checkpoints."""
     keep: int = 3
-    """Latest checkpoints kept, beside the best one."""
+    """Number of latest checkpoints that are kept; the best one is kept too."""
     snapshots: int = 24
-    """Policies kept on the way, evenly over the run, for curves of how each speed was learnt."""
+    """Number of policies kept during the run, evenly spaced, for learning curves of each speed."""
 
     def __post_init__(self):
         require(self.steps >= 1, "run.steps must be at least 1")
@@ -531,9 +578,10 @@ class RunConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """Everything a training depends on. Static: hashable, compared by value."""
+    """All settings of a training. Static: hashable, and compared by value (without `run`)."""
 
     seed: int = 0
+    """Seed of all random numbers."""
     physics: PhysicsConfig = PhysicsConfig()
     env: EnvConfig = EnvConfig()
     command: CommandConfig = CommandConfig()
@@ -558,30 +606,33 @@ class Config:
             ("randomize.push_seconds", self.randomize.push_seconds or self.control_dt),
         ):
             steps = seconds / self.control_dt
-            require(0.5 < steps < COUNTER, f"{name}: {seconds} s are {steps:.2g} control steps")
+            require(
+                0.5 < steps < COUNTER,
+                f"{name}: {seconds} s are {steps:.2g} control steps; 1 to 2^31 are allowed",
+            )
         require(
             self.batch_size < COUNTER,
-            f"env.num_envs x ppo.rollout_steps: {self.batch_size} samples are more than 2^31",
+            f"env.num_envs x ppo.rollout_steps: {self.batch_size} samples, the limit is 2^31",
         )
         require(
             self.env.arms == "free"
             or self.gait.arm_swing == self.gait.arm_swing_slow == self.gait.elbow_bend == 0.0,
             "env.arms: held arms cannot follow gait.arm_swing, gait.arm_swing_slow and "
-            "gait.elbow_bend, set all to 0 (--without arms does)",
+            "gait.elbow_bend: set all three to 0, as --without arms does",
         )
         require(
             self.curriculum.settle_seconds < self.command.resample_seconds,
-            "curriculum.settle_seconds must be below command.resample_seconds: no command would "
-            "ever count",
+            "curriculum.settle_seconds must be below command.resample_seconds: otherwise no "
+            "command settles",
         )
         require(
             self.curriculum.min_episode_steps < self.episode_steps,
             f"curriculum.min_episode_steps must be below the {self.episode_steps} steps of "
-            "env.episode_seconds: no episode would ever do",
+            "env.episode_seconds: no episode can be longer",
         )
         require(
             self.curriculum.cycle_min <= self.gait.cycle_time,
-            "curriculum.cycle_min must not be above gait.cycle_time, where the cycle starts",
+            "curriculum.cycle_min must not be above gait.cycle_time, the first cycle",
         )
         require(
             self.batch_size % self.ppo.minibatches == 0,
@@ -591,12 +642,12 @@ class Config:
 
     @property
     def batch_size(self) -> int:
-        """Samples per update."""
+        """Number of samples per update."""
         return self.env.num_envs * self.ppo.rollout_steps
 
     @property
     def minibatch_size(self) -> int:
-        """Samples per gradient step."""
+        """Number of samples per gradient step."""
         return self.batch_size // self.ppo.minibatches
 
     @property
@@ -606,10 +657,10 @@ class Config:
 
     @property
     def episode_steps(self) -> int:
-        """Control steps until the time limit."""
+        """Number of control steps until the time limit of an episode."""
         return round(self.env.episode_seconds / self.control_dt)
 
     @property
     def num_updates(self) -> int:
-        """Train steps of a whole run."""
+        """Number of train steps of a whole run, rounded up."""
         return -(-self.run.steps // self.batch_size)

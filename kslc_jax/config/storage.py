@@ -1,4 +1,4 @@
-"""Configs as JSON: plain dicts with a schema version, read back strictly."""
+"""Configs as JSON: plain dicts with a schema version. Reading refuses unknown or wrong fields."""
 
 import dataclasses
 import json
@@ -10,7 +10,7 @@ from kslc_jax.config.schema import Config, require
 SCHEMA_VERSION = 1
 
 REMOVED_FIELDS = {"config.physics.clamp_joint_speed"}
-"""Fields of older files that nothing reads any more."""
+"""Fields of older files that the reader ignores."""
 
 
 def to_dict(config: Config) -> dict[str, Any]:
@@ -19,9 +19,9 @@ def to_dict(config: Config) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any]) -> Config:
-    """Inverse of `to_dict`; ConfigError names an unknown or mistyped field.
+    """Inverse of `to_dict`. ConfigError names an unknown field or a wrong value.
 
-    A field that the file lacks has its default: a new field's default gives the numbers of before.
+    A missing field gets its default. So the default of a new field must keep the old behaviour.
     """
     require(isinstance(data, dict), "config: not a JSON object")
     data = dict(data)
@@ -44,7 +44,7 @@ def _build(cls: Any, data: Any, where: str) -> Any:
 
 
 def _value(hint: Any, value: Any, where: str) -> Any:
-    """One field's value, checked against its annotation."""
+    """Checks one value against its type annotation and converts it."""
     wrong = f"{where}: {json.dumps(value, default=str)} is not a valid value"
     origin = typing.get_origin(hint)
     if dataclasses.is_dataclass(hint):

@@ -1,6 +1,6 @@
-"""The robots' models (MJCF). Imports no JAX."""
+"""Models of the robots (MJCF). Imports no JAX."""
 
 from pathlib import Path
 
 XBOT_L = Path(__file__).parent / "xbot_l.xml"
-"""The model of XBot-L, see NOTICE."""
+"""Model of XBot-L; NOTICE gives its source and licence."""
