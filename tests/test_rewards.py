@@ -544,7 +544,7 @@ def test_equation_4_as_printed_and_as_read():
     np.testing.assert_allclose(literal, [-1.0, -2.7182818, -148.41316, -3269017.4], rtol=1e-6)
     assert np.all(
         literal <= -1.0
-    )  # a penalty of 1 at rest; at 15 kg m^2/s it is 3 million
+    )  # the penalty is 1 at rest, and 3 million at an angular momentum of 15 kg m^2/s
     ours = [
         value(KSLC, "angular_momentum", make_inputs(angular_momentum=[m, 0, 0])) for m in momenta
     ]
