@@ -122,7 +122,7 @@ def test_rewards_and_curriculum(execute):
 
 
 def test_the_reward_terms_shown_are_there_and_told():
-    """The notebook plots each of the paper's four terms alone. Other terms share one figure, and
+    """The notebook plots each of the paper's four terms alone. The other terms share figures, and
     each has a sentence."""
     cells = read("03_rewards_and_curriculum").cells
     code, prose = (
@@ -137,7 +137,8 @@ def test_the_reward_terms_shown_are_there_and_told():
 
 
 def test_without_a_checkout_the_address_is_asked_for(tmp_path, monkeypatch):
-    """Rather than what git says of a repository that nobody has; the same cell in all of them."""
+    """The error asks for the address, instead of git's error about a missing repository. All
+    notebooks have the same cell."""
     monkeypatch.delenv("KSLC_REPO", raising=False)
     first, *others = (
         [cell for cell in read(name).cells if "git clone" in cell.source] for name in NAMES
