@@ -39,7 +39,7 @@ SIDEWAYS_COLUMNS: Columns = (
 
 
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
-    """A table of the metrics that `columns` names, one line per commanded speed."""
+    """The numbers of those columns, one line per commanded speed."""
     out = Table(title=title, title_justify="left")
     out.add_column("command [m/s]", justify="right")
     for _, label, _ in columns:
