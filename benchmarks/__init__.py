@@ -1,16 +1,16 @@
-"""Speed, measured: python -m benchmarks.NAME --help, from the repository's root.
+"""Benchmarks. Run python -m benchmarks.NAME --help in the root of the repository.
 
-| module | what it measures |
+| module | measures |
 | --- | --- |
-| `throughput` | a whole train step, and the physics ceiling above it |
+| `throughput` | steps/s of a whole train step, of the rollout, and of physics alone |
 | `comparison` | whole trainings: ours, Brax, PureJaxRL's loop, rsl_rl on torch |
-| `parts` | where the time of a train step goes |
-| `compile_time` | first start and later starts |
+| `parts` | time of each part of a train step |
+| `compile_time` | time of a first start and of a later start |
 | `memory` | peak memory and speed over environments and frames |
-| `gpu` | `throughput` of several sizes and precisions on an accelerator, in one go |
-| `start_test`, `kill_test` | not speed: hundreds of starts, hundreds of kills |
+| `gpu` | `throughput` of several sizes and precisions on an accelerator, in one run |
+| `start_test`, `kill_test` | reliability, not speed: many starts, many kills |
 
-Each prints a table, and the first five keep the numbers with `--json`.
+Each prints its results. The first five store the numbers with `--json`, and `gpu` with `--out`.
 """
 
 from kslc_jax import runtime

@@ -1,14 +1,14 @@
-"""Brax's PPO, as released, on our environment and networks: a thin adapter.
+"""A thin adapter: Brax's PPO, as released, on our environment and networks.
 
-The loop, its storage and its loss are Brax's `ppo.train`; environment, engine, networks, batch,
-minibatches, epochs and coefficients are ours. What cannot be made the same:
+Loop, storage and loss are those of Brax's `ppo.train`. Environment, engine, networks, batch,
+minibatches, epochs and coefficients are ours. These differences remain:
 
-- it keeps two whole observation histories a sample, the one before and the one after the step;
-- it estimates advantages anew in every minibatch, with the critic of the moment, and normalises
-  them there, ours once for the whole batch;
-- it updates observation statistics that nothing uses here;
-- it has no curriculum, no masking of broken samples, and no metrics of reward terms: work that only
-  ours does.
+- Brax stores two whole observation histories per sample: before and after the step.
+- Brax estimates and normalises advantages in every minibatch, with the present critic. Ours does it
+  once for the whole batch.
+- Brax updates observation statistics, which nothing uses here.
+- Brax has no curriculum, no masking of broken samples, and no metrics of reward terms. Only our
+  training does this work.
 """
 
 import threading
@@ -29,7 +29,7 @@ from kslc_jax.config import NUM_JOINTS, Config
 
 
 class Adapter(brax.envs.Env):
-    """Our environment in Brax's terms. It restarts by itself, so Brax's wrapper must not."""
+    """Our environment with Brax's interface. It resets itself, so Brax's wrapper must not."""
 
     def __init__(self, config: Config):
         self.config = config
@@ -67,7 +67,7 @@ class Adapter(brax.envs.Env):
 
 
 def _observe(state: env.EnvState) -> dict[str, jax.Array]:
-    """Flat observations, as Brax wants them."""
+    """Flat observations, as Brax needs them."""
     history, privileged = state.history, state.privileged_history
     return {"state": history.reshape(-1), "privileged_state": privileged.reshape(-1)}
 
@@ -77,7 +77,7 @@ def _wrap(adapter: Adapter, **_: Any) -> brax.envs.Env:
 
 
 def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]:
-    """Our actor and critic behind Brax's interface."""
+    """Our actor and critic with Brax's interface."""
 
     def stacked(obs: jax.Array, width: int) -> jax.Array:
         return obs.reshape(*obs.shape[:-1], -1, width)
@@ -104,9 +104,9 @@ def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]
 
 
 def make(config: Config, most_calls: int) -> Callable[[], None]:
-    """A function that trains one step of `ppo.train`, at most `most_calls` times.
+    """A function that does one train step of `ppo.train`. It works at most `most_calls` times.
 
-    `ppo.train` runs in a thread of its own and waits between steps, where it reports progress.
+    `ppo.train` runs in a separate thread. It waits after each step, in its progress callback.
     """
     go, done = threading.Semaphore(0), threading.Semaphore(0)
     failures: list[Exception] = []

@@ -1,16 +1,16 @@
 """Whole trainings side by side: ours, Brax's PPO, PureJaxRL's loop, rsl_rl on torch.
 
-Same robot, physics settings, networks, batch, minibatches and epochs; all sides train one step each
-in turn, several times. Two tables:
+All have the same robot, physics settings, networks, batch, minibatches and epochs. They take turns,
+one train step each, several times. There are two tables:
 
-- on the `mjx` engine: ours, Brax's `ppo.train` (see brax_ppo.py for what could not be made the
-  same) and a loop of PureJaxRL's shape (purejaxrl.py), each with the preset's own networks;
-- on C MuJoCo: ours, the same loop on the same engine, and rsl_rl's PPO over worker processes
-  (torch_rsl.py), each with plain networks, for torch has no symmetric ones.
+- On the `mjx` engine: ours, Brax's `ppo.train` (brax_ppo.py names the differences), and a loop in
+  the form of PureJaxRL (purejaxrl.py). All use the networks of the preset.
+- On C MuJoCo: ours, the same loop on the same engine, and rsl_rl's PPO over worker processes
+  (torch_rsl.py). All use plain networks, because torch has no symmetric ones.
 
   pip install brax gymnasium rsl-rl-lib torch
   python -m benchmarks.comparison [--repeats 5] [--json comparison.json]
-  python -m benchmarks.comparison --short       # small sizes: does everything still run?
+  python -m benchmarks.comparison --short       # small sizes: tests that everything runs
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ Side = Literal["brax", "purejaxrl", "torch"]
 
 
 def on_mjx(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seconds:
-    """Seconds a train step on the mjx engine."""
+    """Seconds of each train step on the mjx engine."""
     config = timing.on_engine(config, "mjx")
     runs = {OURS: throughput.training(config)}
     if "purejaxrl" in sides:
@@ -38,12 +38,12 @@ def on_mjx(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seco
         from benchmarks import brax_ppo
 
         runs["brax"] = brax_ppo.make(config, repeats + 2)
-        runs["brax"]()  # it compiles in its first two steps
+        runs["brax"]()  # Brax compiles in its first two steps
     return timing.in_turn(runs, repeats)
 
 
 def on_c_mujoco(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seconds:
-    """Seconds a train step with C MuJoCo's physics and plain networks."""
+    """Seconds of each train step with C MuJoCo's physics and plain networks."""
     config = timing.on_engine(config, "mujoco")
     config = dataclasses.replace(
         config, network=dataclasses.replace(config.network, symmetric=False)
@@ -62,7 +62,7 @@ TABLES = {"mjx": on_mjx, "mujoco": on_c_mujoco}
 
 
 def summary(seconds: timing.Seconds, batch: int) -> dict[str, dict[str, Any]]:
-    """Steps/s of each side, and how many times as fast ours is: median and range over repeats."""
+    """Steps/s of each side, and its time divided by ours: from medians, and the range of turns."""
     medians = timing.medians(seconds)
     return {
         name: {
@@ -81,15 +81,15 @@ class Args:
     """Control steps/s of whole trainings, and ratios."""
 
     preset: str = "laptop"
-    """Whose sizes to use."""
+    """Preset that gives the sizes."""
     repeats: int = 5
     """Timed train steps of each side."""
     engines: tuple[Literal["mjx", "mujoco"], ...] = ("mujoco", "mjx")
-    """Which tables to make."""
+    """Engines, one table each."""
     sides: tuple[Side, ...] = ("brax", "purejaxrl", "torch")
-    """Whom to compare with."""
+    """Trainings to compare with ours; each engine uses those that it supports."""
     short: bool = False
-    """The debug preset's sizes, everything once."""
+    """Sizes of the debug preset, and one timed step."""
     json: Path | None = None
     """File for the numbers."""
 

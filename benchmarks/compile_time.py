@@ -1,7 +1,7 @@
-"""How long a training takes to start: imports, tracing, compilation, first step.
+"""Start time of a training: imports, tracing, compilation, first step.
 
-Each measurement is a process of its own. The first one meets an empty compilation cache, the second
-the one that the first left.
+Each measurement is a separate process. The first process has an empty compilation cache. The second
+uses the cache of the first.
 
   python -m benchmarks.compile_time [--presets laptop paper] [--engines mujoco mjx]
 """
@@ -40,7 +40,7 @@ def once(preset_name: str, engine: str, num_envs: int | None) -> dict[str, float
 
 
 def cold_and_warm(preset_name: str, engine: str, num_envs: int | None) -> dict[str, dict]:
-    """Phases of a first start and of a second."""
+    """Seconds of the phases of a first start and of a second start."""
     args = ["--presets", preset_name, "--engines", engine, "--here"]
     args += [] if num_envs is None else ["--num-envs", str(num_envs)]
     with tempfile.TemporaryDirectory() as cache:
@@ -57,11 +57,11 @@ class Args:
     """Seconds from starting Python to the end of the first train step."""
 
     presets: tuple[str, ...] = ("laptop", "paper")
-    """Whose sizes to use."""
+    """Presets that give the sizes."""
     engines: tuple[str, ...] = ("mujoco", "mjx")
     """Physics engines."""
     num_envs: int | None = None
-    """Environments; each preset's own if not given."""
+    """Number of environments. The default is that of each preset."""
     json: Path | None = None
     """File for the numbers."""
     here: bool = False

@@ -1,9 +1,9 @@
-"""Control steps/s on a machine with an accelerator, in one go of minutes; no network.
+"""Control steps/s on a machine with an accelerator, in one run of minutes, without a network.
 
-Of each case, ENGINE:ENVIRONMENTSxSTEPS, it measures physics alone, the rollout and whole training;
-then whole training at other matrix-product precisions of networks and signals (the physics always
-computes in full float32). All programs are compiled first, at the same time, on all cores; a case
-that fails is told and leaves the others alone.
+For each case, ENGINE:ENVIRONMENTSxSTEPS, it measures physics alone, the rollout and whole training.
+Then it measures whole training at other matrix-product precisions of networks and signals; the
+physics always computes in full float32. All programs compile first, at the same time, on all cores.
+If a case fails, the benchmark prints it and goes on with the others.
 
   python -m benchmarks.gpu --out gpu.json
   python -m benchmarks.gpu --preset paper --cases mjx:4096x60 --out paper.json
@@ -34,7 +34,7 @@ Part = Literal["physics only", "rollout", "whole training"]
 
 
 def shaped(base: Config, case: str) -> Config:
-    """`base` with a case's engine, number of environments and steps of a rollout."""
+    """`base` with the engine, number of environments and rollout steps of a case."""
     found = re.fullmatch(r"(mjx|mujoco):(\d+)x(\d+)", case)
     if found is None:
         raise ConfigError(f"{case!r} is no case: mjx:2048x24 is one")
@@ -44,7 +44,7 @@ def shaped(base: Config, case: str) -> Config:
 
 
 def at_precision(config: Config, name: str) -> Run:
-    """Whole training under a matrix-product precision."""
+    """A function that does one train step at a matrix-product precision."""
     run = throughput.training(config)
 
     def again() -> None:
@@ -55,7 +55,10 @@ def at_precision(config: Config, name: str) -> Run:
 
 
 def first_calls(makes: Mapping[str, Callable[[], Run]]) -> dict[str, Run]:
-    """Makes all runs and calls each once, at the same time: XLA compiles one program a core."""
+    """Makes all runs and calls each once, in parallel, because XLA compiles a program on one core.
+
+    Returns the runs that did not fail.
+    """
 
     def one(name: str) -> Run | None:
         start = time.monotonic()
@@ -74,31 +77,31 @@ def first_calls(makes: Mapping[str, Callable[[], Run]]) -> dict[str, Run]:
 
 
 def peak_gib() -> float | None:
-    """Most device memory held so far; None where the device does not say."""
+    """Peak device memory so far [GiB]; None if the device does not report it."""
     stats = jax.devices()[0].memory_stats() or {}
     return stats["peak_bytes_in_use"] / 2**30 if "peak_bytes_in_use" in stats else None
 
 
 @dataclass(frozen=True)
 class Args:
-    """Measures a machine with an accelerator."""
+    """Control steps/s on a machine with an accelerator."""
 
     out: Path | None = None
     """File for the numbers."""
     preset: str = "laptop"
-    """Whose networks, and all else that a case leaves open."""
+    """Preset that gives the networks, and all values that a case does not set."""
     cases: tuple[str, ...] = ("mjx:2048x24", "mjx:4096x12", "mjx:8192x6")
-    """ENGINE:ENVIRONMENTSxSTEPS. The three have the laptop preset's samples in a batch."""
+    """ENGINE:ENVIRONMENTSxSTEPS. The default cases have the batch size of the laptop preset."""
     parts: tuple[Part, ...] = ("physics only", "rollout", "whole training")
-    """What to measure of each case."""
+    """Parts to measure in each case."""
     precisions: tuple[str, ...] = ("tensorfloat32", "float32")
-    """Matrix-product precisions at which the first case trains besides."""
+    """More matrix-product precisions, measured with the whole training of the first case."""
     repeats: int = 5
-    """Timed calls of each."""
+    """Timed calls of each program."""
 
 
 def main(args: Args) -> None:
-    """Compiles all, measures in turn, prints a line each."""
+    """Compiles all programs, measures them in turn, and prints a line for each."""
     try:
         configs = {case: shaped(preset(args.preset), case) for case in args.cases}
     except ConfigError as error:

@@ -1,8 +1,8 @@
-"""The same robot as a Gymnasium environment in numpy and C MuJoCo, as one would write it by hand.
+"""The same robot as a Gymnasium environment in numpy and C MuJoCo, in the usual hand-written style.
 
-Physics, motors, control rate, frames and histories are ours, to the number. The rest is less than
-what our environment does, in this one's favour: no domain randomisation, no pushes, and a dozen of
-the reward terms. It exists to be timed; nobody trains with it.
+Physics, motors, control rate, frames and histories give the same numbers as ours. Otherwise it does
+less work than our environment, which favours it in a comparison: no domain randomisation, no
+pushes, and only a dozen reward terms. It is for timing, not for training.
 """
 
 import copy
@@ -107,7 +107,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
             mujoco.mj_step(self.model, data)
 
     def _read(self) -> None:
-        """Everything that observations and rewards share."""
+        """Computes the signals that observations and rewards share."""
         data, config = self.data, self.config
         w, x, y, z = quat = data.qpos[3:7]
         self.euler = np.array(
@@ -135,7 +135,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         self.reference = leg * (left * min(s, 0.0) + right * max(s, 0.0))
 
     def _observe(self) -> Observation:
-        """Appends the frames of the present; copies of the histories [K, 59] and [Kp, 89]."""
+        """Appends the present frames; returns copies of the histories [K, 59] and [Kp, 89]."""
         joint_pos, joint_vel = self.data.qpos[7:], self.data.qvel[6:]
         shared = [self.clock, self.command, joint_pos, joint_vel, self.action]
         actor = np.concatenate([*shared, self.angvel, self.euler]) * self._scale["policy"]
@@ -168,7 +168,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         return self.data.qpos[2] + self.up @ centre - np.abs(self.up) @ half
 
     def _reward(self, last_joint_vel: np.ndarray) -> float:
-        """A dozen of the terms, weighted."""
+        """The weighted sum of a dozen terms."""
         c, w, dt = self.config.rewards, self.config.rewards.weights, self.config.control_dt
         joint_pos, joint_vel = self.data.qpos[7:], self.data.qvel[6:]
         error = np.linalg.norm(joint_pos - self.reference)

@@ -1,9 +1,9 @@
-"""Kills trainings at random moments, and checks that what comes out is as if nobody had.
+"""Kills trainings at random moments, and checks that the results do not change.
 
-One run folder is started, killed and resumed again and again: by SIGKILL and SIGTERM, while JAX
-compiles, in mid-training and in the middle of a save. Each resume has to go on from the last whole
-checkpoint, and in the end every record of metrics.jsonl, wall-clock columns apart, has to equal
-that of a training that nobody disturbed, bit for bit. Exit code 1 if anything differs.
+One training is started, killed and resumed many times. The signals are SIGKILL and SIGTERM. They
+come while JAX compiles, during the training, and during a save. Each resume must go on from the
+last complete checkpoint. In the end every record of metrics.jsonl, without the wall-clock columns,
+must equal that of an undisturbed training, bit for bit. The exit code is 1 if anything differs.
 
   python benchmarks/kill_test.py [--kills 30] [--terms 10] [--seed 0] [--folder FOLDER]
 """
@@ -25,11 +25,11 @@ from kslc_jax.config import preset
 
 WALL_CLOCK = ("seconds", "steps_per_second")
 MOMENTS = {"start": 1, "training": 4, "save": 5}
-"""When to kill, and how often: before the training runs, while it does, while it saves."""
+"""Moments of a kill with their weights: before the training runs, while it runs, while it saves."""
 
 
 class Failure(Exception):
-    """Something was lost."""
+    """The training failed, or it lost data."""
 
 
 def command(run_dir: Path, *args: object) -> list[str]:
@@ -39,18 +39,18 @@ def command(run_dir: Path, *args: object) -> list[str]:
 
 
 def checkpoints(run_dir: Path) -> list[int]:
-    """Train steps of the whole checkpoints, oldest first."""
+    """Train steps of the complete checkpoints, oldest first."""
     folders = (run_dir / files.CHECKPOINTS).glob("*")
     return sorted(int(p.name) for p in folders if p.name.isdigit())
 
 
 def saving(run_dir: Path) -> bool:
-    """Whether a half-written checkpoint is there."""
+    """True if there is a half-written checkpoint."""
     return any((run_dir / files.CHECKPOINTS).glob("*.orbax-checkpoint-tmp"))
 
 
 def wait_until(what, process: subprocess.Popen, log: Path, seconds: float = 300.0) -> None:
-    """Polls `what()`; Failure if the process ends or the time is over before it is true."""
+    """Waits until `what()` is true. Failure if the process ends or the time is over before that."""
     end = time.monotonic() + seconds
     while not what():
         if process.poll() is not None or time.monotonic() > end:
@@ -59,7 +59,7 @@ def wait_until(what, process: subprocess.Popen, log: Path, seconds: float = 300.
 
 
 def kill(run_dir: Path, number: signal.Signals, moment: str, log: Path, rng: random.Random) -> bool:
-    """Starts or resumes the training and kills it; whether that was in the middle of a save."""
+    """Starts or resumes the training and kills it; True if the kill came during a save."""
     before = checkpoints(run_dir)
     often = ["--preset", "debug", "--steps", 10**9, "--run.checkpoint-minutes", 0.002]
     with log.open("w") as out:
@@ -87,19 +87,19 @@ def kill(run_dir: Path, number: signal.Signals, moment: str, log: Path, rng: ran
 
 
 def records(run_dir: Path) -> list[dict[str, float]]:
-    """metrics.jsonl without what depends on the wall clock."""
+    """The records of metrics.jsonl without the columns that depend on the wall clock."""
     rows = [json.loads(line) for line in (run_dir / files.METRICS).read_text().splitlines()]
     return [{k: v for k, v in row.items() if k not in WALL_CLOCK} for row in rows]
 
 
 def main(kills: int = 30, terms: int = 10, seed: int = 0, folder: Path | None = None) -> int:
-    """Prints what was done and how many records differ; 1 if any does.
+    """Prints the number of kills and of records that differ. Returns 1 if any record differs.
 
     Args:
-      kills: how often to send SIGKILL.
-      terms: how often to send SIGTERM.
-      seed: of the moments.
-      folder: where the two run folders go; a temporary folder if not given.
+      kills: number of SIGKILLs.
+      terms: number of SIGTERMs.
+      seed: seed of the moments.
+      folder: folder for the two run folders; the default is a temporary folder.
     """
     rng = random.Random(seed)
     folder = Path(tempfile.mkdtemp()) if folder is None else folder

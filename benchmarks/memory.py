@@ -1,11 +1,11 @@
 """Memory and speed of whole training over environments and frames; one process for each point.
 
-`peak` is all that the process ever held, on an accelerator what the device did. `estimated` is
-what `training.memory` reckons before anything is compiled, `planned` what XLA says once it is; on a
-CPU the process holds its own imports, the compiler and two states besides.
+`peak` is the peak memory of the process, or on an accelerator that of the device. `estimated` is
+the estimate of `training.memory` before compilation. `planned` is XLA's figure after compilation.
+On a CPU the peak also has the imports, the compiler and two states.
 
-A point that does not fit, by the estimate or by its death, is told and left out. What is measured
-is drawn, also where the time is up before the end.
+The benchmark prints and leaves out a point that does not fit: by its estimate, or because its
+process dies. It draws the measured points, also when the time is over before the end.
 
   python -m benchmarks.memory [--num-envs 256 1024 4096 16384] [--frames 1 5 15] [--out memory.png]
   python -m benchmarks.memory --minutes 8           # begins no new point after that
@@ -66,7 +66,7 @@ def once(preset_name: str, num_envs: int, frames: int, repeats: int) -> dict[str
 
 
 def _peak() -> int:
-    """Largest number of bytes held so far."""
+    """Peak memory so far [bytes]."""
     import jax
 
     stats = jax.devices()[0].memory_stats() or {}
@@ -75,7 +75,7 @@ def _peak() -> int:
 
 
 def child(args: "Args", num_envs: int, frames: int) -> dict[str, float] | None:
-    """One point, in a process of its own; None where it did not fit or was killed."""
+    """One point, in a separate process; None if it does not fit or if a signal killed it."""
     where = ["--num-envs", str(num_envs), "--frames", str(frames), "--preset", args.preset]
     try:
         return timing.child("benchmarks.memory", [*where, "--repeats", str(args.repeats), "--here"])
@@ -91,7 +91,7 @@ def here(args: "Args") -> int:
 
     from kslc_jax.config import ConfigError
 
-    with contextlib.suppress(OSError):  # if memory runs out, the system is to kill this process
+    with contextlib.suppress(OSError):  # if memory runs out, Linux kills this process first
         Path("/proc/self/oom_score_adj").write_text("1000")
     try:
         print(json.dumps(once(args.preset, args.num_envs[0], args.frames[0], args.repeats)))
@@ -103,7 +103,7 @@ def here(args: "Args") -> int:
 
 
 def line(point: dict[str, float]) -> str:
-    """A point in words."""
+    """A point as text."""
     return (
         f"{point['peak_mib']:7.0f} MiB (before it compiled {point['before_mib']:.0f}; estimated "
         f"{point['estimated_mib']:.0f}, planned {point['planned_mib']:.0f}), "
@@ -142,17 +142,17 @@ class Args:
     """Peak memory and control steps/s of whole training."""
 
     preset: str = "laptop"
-    """Whose other sizes to use."""
+    """Preset that gives all other sizes."""
     num_envs: tuple[int, ...] = (256, 1024, 4096, 16384)
-    """Environments."""
+    """Numbers of environments."""
     frames: tuple[int, ...] = (1, 5, 15)
-    """Frames of actor history."""
+    """Numbers of frames in the actor history."""
     repeats: int = 1
     """Timed train steps at each point."""
     minutes: float = 60.0
-    """When no new point is begun."""
+    """No new point starts after this time."""
     out: Path | None = None
-    """Picture of both."""
+    """File for a picture of memory and speed."""
     json: Path | None = None
     """File for the numbers."""
     here: bool = False

@@ -1,8 +1,8 @@
-"""Where the time of a train step goes: timed parts, a bar chart, and the profiler's trace.
+"""Time of each part of a train step: a table, a bar chart, and the profiler's trace.
 
-Each part is a program of its own, timed in turn with the others; what a part has more than the one
-that it contains is the difference of the two. Copies between parts are counted in none, so the sum
-need not be the whole: `unaccounted` says by how much.
+Several programs are timed in turn. If one program contains another, the difference of their times
+is the time of the rest. No part has the copies between the parts, so the sum may differ from the
+time of the whole step. `unaccounted` is this difference.
 
   python -m benchmarks.parts [--preset laptop] [--engines mujoco mjx] [--out docs/profile.png]
   python -m benchmarks.parts --trace runs/trace     # for xprof, Perfetto or TensorBoard
@@ -33,7 +33,7 @@ PARTS = ("physics", "rest of rollout", "GAE and samples", "windows", "gradient s
 
 
 def timed(config: Config) -> dict[str, Callable[[], Any]]:
-    """The programs whose seconds, and differences of seconds, are the parts."""
+    """The programs to time. `split` computes the parts from their times."""
     state = train_step.make(config)[0]()
 
     def roll(state):
@@ -120,7 +120,7 @@ def draw(results: dict[str, dict[str, float]], title: str, out: Path) -> None:
 
 
 def trace(config: Config, folder: Path) -> None:
-    """The profiler's trace of one train step, compiled beforehand."""
+    """Writes the profiler's trace of one train step, which is already compiled."""
     run = throughput.training(config)
     run()
     with profiling.trace(str(folder)):
@@ -133,13 +133,13 @@ class Args:
     """Seconds of each part of a train step."""
 
     preset: str = "laptop"
-    """Whose sizes to use."""
+    """Preset that gives the sizes."""
     repeats: int = 5
     """Timed calls of each part."""
     engines: tuple[str, ...] = ("mujoco", "mjx")
     """Physics engines to compare."""
     out: Path | None = None
-    """Picture of the parts, one bar per engine; with --trace, of what the threads do when."""
+    """Picture of the parts, one bar per engine; with --trace, a timeline of the threads."""
     json: Path | None = None
     """File for the numbers."""
     trace: Path | None = None

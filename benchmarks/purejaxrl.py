@@ -1,7 +1,7 @@
-"""Our train step in the shape of PureJaxRL's loop, from the same pieces.
+"""Our train step in the form of PureJaxRL's loop, built from the same functions.
 
-What differs: each step stores its whole observation histories, and each epoch flattens, shuffles
-and cuts the whole batch. The numbers that come out are the same.
+Two things differ. Each step stores its whole observation histories. Each epoch flattens, shuffles
+and splits the whole batch. The results are the same up to rounding.
 """
 
 from collections.abc import Callable
@@ -16,13 +16,13 @@ from kslc_jax.ppo import Learner, Samples
 from kslc_jax.train_step import Metrics, TrainState
 
 Stored = tuple[Samples, jax.Array, jax.Array]
-"""Samples and the histories that were seen: [B, ...], [B, K, 59], [B, Kp, 89]."""
+"""Samples, and the histories of actor and critic: [B, ...], [B, K, 59], [B, Kp, 89]."""
 
 
 def make(
     config: Config,
 ) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
-    """(init, step), as `train_step.make`."""
+    """(init, step), like `train_step.make`."""
     return train_step.make(config)[0], jax.jit(lambda s: step(config, s), donate_argnums=0)
 
 
@@ -54,7 +54,7 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
 def _update(
     config: Config, state: TrainState, stored: Stored, key: jax.Array
 ) -> tuple[Learner, Metrics]:
-    """All epochs: shuffle everything, cut it, one gradient step on each piece."""
+    """All epochs: shuffle the batch, split it, and do one gradient step on each minibatch."""
     constants = train_step.rollout_constants(config, state)
 
     def minibatch(learner: Learner, batch: Stored) -> tuple[Learner, Metrics]:

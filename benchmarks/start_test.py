@@ -1,9 +1,10 @@
-"""Does a start ever hang? Starts many processes, one after the other, and counts those that do.
+"""Starts many processes, one after the other, and counts those that hang.
 
-Each compiles and runs a short rollout, policy and physics of 256 robots for 100 control steps, with
-the mujoco engine on one thread and on two, and with mjx. What has hung on some JAX versions, two
-batched Cholesky factorisations waiting for each other and a callback waiting for the program that
-waits for it, needs no more than that. Exit code 1 if one hangs or fails.
+Each process compiles and runs the physics of 256 robots for 100 control steps, with one action of a
+policy. It uses the mujoco engine on one thread and on two, or mjx on one CPU core and on all. This
+is enough to find two hangs of some JAX versions: two batched Cholesky factorisations that wait for
+each other, and a callback that waits for the program that waits for it. The exit code is 1 if a
+process hangs or fails.
 
   python -m benchmarks.start_test [--starts 200]
 """
@@ -20,16 +21,16 @@ import tyro
 Engine = Literal["mujoco", "mjx"]
 
 KINDS: tuple[tuple[Engine, int], ...] = (("mujoco", 1), ("mujoco", 2), ("mjx", 1), ("mjx", 2))
-"""Engine, and how many threads: of C MuJoCo's batch, or of all that XLA runs on."""
+"""Engine, and number of threads of C MuJoCo's batch. For mjx, 1 means one CPU core and 2 all."""
 
 LIMIT = 300.0
-"""Seconds after which a start counts as hung; the longest compile here is a tenth of that."""
+"""Seconds after which a start counts as hung. The longest compilation takes a tenth of this."""
 
 ROBOTS, STEPS = 256, 100
 
 
 def rollout(engine: Engine, threads: int) -> None:
-    """What one start does."""
+    """The work of one start; exits with an error if a number is not finite."""
     from kslc_jax import runtime
 
     runtime.prepare()
@@ -60,7 +61,7 @@ def rollout(engine: Engine, threads: int) -> None:
 
 
 def start(engine: Engine, threads: int) -> str:
-    """Starts one process; 'ok', 'hung' or 'failed'."""
+    """Starts one process; returns 'ok', 'hung' or 'failed'."""
     command = [sys.executable, "-m", "benchmarks.start_test", "--once", engine, str(threads)]
     if engine == "mjx" and threads == 1:
         command = ["taskset", "--cpu-list", "0", *command]
@@ -75,11 +76,11 @@ def start(engine: Engine, threads: int) -> str:
 
 
 def main(starts: int = 200, once: tuple[Engine, int] | None = None) -> int:
-    """Prints how the starts ended; 1 if any did not end well.
+    """Prints how the starts ended; returns 1 if any hung or failed.
 
     Args:
-      starts: how many processes, a quarter of each kind.
-      once: engine and threads: be one of those processes.
+      starts: number of processes, a quarter of each kind.
+      once: engine and threads; do the work of one such process here.
     """
     if once is not None:
         rollout(*once)

@@ -1,6 +1,6 @@
-"""Whole-training throughput, and the ceiling above it: control steps/s, medians and ratios.
+"""Throughput of whole training and its upper limit, physics alone: median control steps/s, ratios.
 
-Runs physics alone (random actions), the rollout, and the whole train step of a preset in turn.
+It runs in turn: physics alone (random actions), the rollout, and the whole train step of a preset.
 
   python -m benchmarks.throughput [--preset laptop] [--repeats 5] [--engines mujoco mjx]
 """
@@ -20,7 +20,7 @@ from kslc_jax.config import NUM_JOINTS, Config, preset
 
 
 def physics_only(config: Config) -> Callable[[], Any]:
-    """One rollout's physics under random joint targets; nothing else."""
+    """A function that runs only the physics of one rollout, with random joint targets."""
     state = train_step.make(config)[0]()
 
     def one(envs, key):
@@ -37,7 +37,7 @@ def physics_only(config: Config) -> Callable[[], Any]:
 
 
 def rollout(config: Config) -> Callable[[], Any]:
-    """One rollout: physics, environment and networks, no learning."""
+    """A function that runs one rollout: physics, environment and networks, without learning."""
     state = train_step.make(config)[0]()
 
     def one(state):
@@ -49,12 +49,12 @@ def rollout(config: Config) -> Callable[[], Any]:
 
 
 def training(config: Config) -> Callable[[], Any]:
-    """The whole train step, each on the state that the last one left."""
+    """A function that does one train step, from the state after the last call."""
     return stepping(*train_step.make(config))
 
 
 def stepping(init: Callable[[], Any], step: Callable[[Any], tuple[Any, Any]]) -> Callable[[], Any]:
-    """A function that takes one step from where the last one stopped."""
+    """A function that does one step, from the state after the last call."""
     held = [init()]
 
     def run():
@@ -79,9 +79,9 @@ class Args:
     """Control steps/s of physics alone, of the rollout and of whole training."""
 
     preset: str = "laptop"
-    """Whose sizes to use."""
+    """Preset that gives the sizes."""
     num_envs: int | None = None
-    """Environments; the preset's own if not given."""
+    """Number of environments. The default is that of the preset."""
     repeats: int = 5
     """Timed calls of each part."""
     engines: tuple[str, ...] = ("mujoco", "mjx")

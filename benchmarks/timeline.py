@@ -1,4 +1,4 @@
-"""The profiler's trace of one train step as a picture: what each of XLA's threads does, when.
+"""Draws the profiler's trace of one train step: the work of each XLA thread over time.
 
 python -m benchmarks.parts --engines mujoco --trace runs/trace --out docs/timeline.png
 """
@@ -20,7 +20,7 @@ _NO_WORK = ("while", "call", "conditional", "end:")
 
 
 class Operation(NamedTuple):
-    """One operation of the compiled program, of those that consist of no others."""
+    """One operation of the compiled program that contains no other operations."""
 
     thread: int
     kind: str  # one of COLORS
@@ -29,14 +29,17 @@ class Operation(NamedTuple):
 
 
 def kind(name: str) -> str:
-    """Of an XLA operation's name; only C MuJoCo's physics is an operation by itself."""
+    """The kind of an XLA operation, by its name. A callback is the physics of C MuJoCo.
+
+    The physics of MJX consists of many operations, and counts as "other operations".
+    """
     if "callback" in name:
         return "physics"
     return "matrix products" if name.startswith(("dot", "custom-call")) else "other operations"
 
 
 def read(folder: Path) -> list[Operation]:
-    """Operations of the latest trace in `folder`, seconds from the start of the first."""
+    """Operations of the latest trace in `folder`. Times are in seconds from the first start."""
     latest = max(folder.glob("plugins/profile/*/*.trace.json.gz"), key=lambda p: p.stat().st_mtime)
     events = json.loads(gzip.decompress(latest.read_bytes()))["traceEvents"]
     done = [
@@ -49,7 +52,7 @@ def read(folder: Path) -> list[Operation]:
 
 
 def seconds(operations: list[Operation]) -> dict[str, float]:
-    """Thread-seconds of each kind."""
+    """Seconds of each kind, summed over threads."""
     total = dict.fromkeys(COLORS, 0.0)
     for op in operations:
         total[op.kind] += op.end - op.start
@@ -57,8 +60,10 @@ def seconds(operations: list[Operation]) -> dict[str, float]:
 
 
 def draw(operations: list[Operation], title: str, out: Path) -> None:
-    """A row for each thread that does more than a hundredth of it all, a color for each kind, with
-    thread-seconds in the legend."""
+    """Draws a row for each thread with more than 1 % of the work, and a colour for each kind.
+
+    The legend has the seconds of each kind, summed over threads.
+    """
     by_thread: dict[int, list[Operation]] = defaultdict(list)
     for op in operations:
         by_thread[op.thread].append(op)

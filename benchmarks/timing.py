@@ -1,4 +1,4 @@
-"""What the benchmarks share: timing in turn, machines in words, results on disk."""
+"""Shared functions of the benchmarks: timing in turn, description of the machine, result files."""
 
 import dataclasses
 import json
@@ -18,9 +18,10 @@ Seconds = dict[str, list[float]]
 
 
 def in_turn(runs: Mapping[str, Callable[[], Any]], repeats: int) -> Seconds:
-    """Seconds of each of `repeats` calls of each run, all runs in turn.
+    """Seconds of `repeats` calls of each run. The runs take turns.
 
-    Drifts of the machine so hit all alike. A first call of each compiles and does not count.
+    So a drift of the machine's speed affects all runs alike. The first call of each run compiles
+    and does not count.
     """
     for run in runs.values():
         run()
@@ -44,14 +45,14 @@ def on_engine(config: Config, engine: Any) -> Config:
 
 
 def resized(config: Config, num_envs: int | None = None, frames: int | None = None) -> Config:
-    """`config` with other numbers of environments and of actor frames, where given."""
+    """`config` with another number of environments or of actor frames; None keeps the number."""
     changes = {"num_envs": num_envs, "frames": frames}
     changes = {name: value for name, value in changes.items() if value is not None}
     return dataclasses.replace(config, env=dataclasses.replace(config.env, **changes))
 
 
 def child(module: str, args: list[str], env: dict[str, str] | None = None) -> Any:
-    """What `python -m MODULE ARGS` prints last, which is JSON."""
+    """Runs `python -m MODULE ARGS` and returns its last line, which must be JSON."""
     done = subprocess.run(
         [sys.executable, "-m", module, *args],
         env={**os.environ, **(env or {})},
@@ -63,7 +64,7 @@ def child(module: str, args: list[str], env: dict[str, str] | None = None) -> An
 
 
 def machine() -> dict[str, Any]:
-    """The machine and what ran on it, in words that a reader can compare with their own."""
+    """Hardware, load and software versions, so that a reader can compare machines."""
     import jax
     import mujoco
 
@@ -87,7 +88,7 @@ def _cpu_model() -> str:
 
 
 def report(result: dict[str, Any], path: Path | None) -> None:
-    """Writes a result beside the machine that it was measured on, where a path is given."""
+    """Writes a result and the description of the machine to `path`, if it is given."""
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps({"machine": machine(), **result}, indent=1) + "\n")

@@ -1,8 +1,8 @@
-"""What one would take without JAX: rsl_rl's PPO on torch, C MuJoCo in worker processes.
+"""A usual setup without JAX: rsl_rl's PPO on torch, with C MuJoCo in worker processes.
 
-rsl_rl is the learner of Humanoid-Gym, which the paper builds on: the same algorithm as ours, with
-the same coefficients. Each worker process steps its share of Gymnasium environments one by one and
-writes to shared memory.
+rsl_rl is the learner of Humanoid-Gym, on which the paper builds. Algorithm and coefficients are the
+same as ours. Each worker process steps its Gymnasium environments one by one and writes to shared
+memory.
 """
 
 import contextlib
@@ -25,7 +25,7 @@ from kslc_jax.config import NUM_JOINTS, Config
 
 
 def _widths(config: Config) -> dict[str, int]:
-    """Columns of the shared table, one row an environment."""
+    """Widths of the columns of the shared table, which has one row per environment."""
     return {
         "policy": config.env.frames * observations.ACTOR_WIDTH,
         "critic": config.env.privileged_frames * observations.CRITIC_WIDTH,
@@ -37,7 +37,7 @@ def _widths(config: Config) -> dict[str, int]:
 
 
 def _columns(config: Config, raw: Any) -> dict[str, np.ndarray]:
-    """Views of the shared memory by name [N, width]."""
+    """Views of the shared memory, by name: [N, width]."""
     widths = _widths(config)
     table = np.frombuffer(raw, np.float32).reshape(config.env.num_envs, -1)
     parts = np.split(table, np.cumsum(list(widths.values()))[:-1], axis=1)
@@ -45,7 +45,7 @@ def _columns(config: Config, raw: Any) -> dict[str, np.ndarray]:
 
 
 def _work(config: Config, raw: Any, rows: range, pipe: Connection) -> None:
-    """A worker: steps its environments whenever it is told to, until the pipe closes."""
+    """A worker. It steps its environments after each message, until the pipe closes."""
     columns = _columns(config, raw)
     envs = {row: XBot(config, seed=row) for row in rows}
 
@@ -70,7 +70,7 @@ def _work(config: Config, raw: Any, rows: range, pipe: Connection) -> None:
 
 
 class Workers(VecEnv):
-    """All environments as one, for rsl_rl."""
+    """All environments as one vectorised environment for rsl_rl."""
 
     num_actions = NUM_JOINTS
     device = "cpu"
@@ -111,7 +111,7 @@ class Workers(VecEnv):
 
 
 def _settings(config: Config) -> dict[str, Any]:
-    """Our networks and coefficients in rsl_rl's words."""
+    """Our networks and coefficients as settings of rsl_rl."""
     network = {"class_name": "MLPModel", "activation": "elu"}
     gaussian = {"class_name": "GaussianDistribution", "init_std": config.network.init_std}
     ppo = config.ppo
@@ -141,7 +141,7 @@ def _settings(config: Config) -> dict[str, Any]:
 
 def make(config: Config) -> Callable[[], None]:
     """A function that trains one iteration: a rollout and its update."""
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
+    with contextlib.redirect_stdout(io.StringIO()):  # rsl_rl prints its networks
         runner = OnPolicyRunner(Workers(config), _settings(config))
 
     def run() -> None:

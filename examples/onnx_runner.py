@@ -1,4 +1,4 @@
-"""Drives XBot-L in MuJoCo from an exported policy: numpy and onnxruntime, no JAX (docs/export.md).
+"""Runs an exported policy on XBot-L in MuJoCo: numpy, onnxruntime, no JAX (docs/export.md).
 
 python examples/onnx_runner.py policy.onnx --vx 1.0 --seconds 10
 """
@@ -14,7 +14,7 @@ import onnxruntime
 
 
 class Controller:
-    """Measurements in, joint targets out, once per control step; keeps clock and history."""
+    """Computes joint targets from measurements, once per control step; keeps clock and history."""
 
     def __init__(self, path, vx, vy=0.0, heading=0.0):
         self.network = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -30,7 +30,11 @@ class Controller:
         self.history = np.zeros((m.history_length, sum(c.width for c in m.frame)), np.float32)
 
     def frame(self, quat, angvel, joint_pos, joint_vel):
-        """Observation of one instant: base attitude (w, x, y, z), base rates in its own frame."""
+        """The observation frame of one control step.
+
+        quat: base orientation (w, x, y, z). angvel: [3] rad/s, in the base frame. joint_pos,
+        joint_vel: [16] rad and rad/s.
+        """
         m, (w, x, y, z) = self.meta, quat
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -56,7 +60,7 @@ class Controller:
         return gait.base_cycle_time + share * (gait.cycle_time - gait.base_cycle_time)
 
     def targets(self, *measured):
-        """Joint targets [rad] until the next control step; advances clock and history."""
+        """Joint targets [rad] until the next control step. It advances clock and history."""
         m, gait = self.meta, self.meta.gait
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
         action = np.array(self.network.run(["action"], {"history": self.history[None]})[0])[0]
@@ -66,19 +70,20 @@ class Controller:
 
 
 def motor_torque(m, target, q, dq):
-    """PD torque [N m]; driving torque falls to zero at the speed limit and brakes beyond it."""
+    """PD torque within the limits [N m]. Near the speed limit the driving torque falls to zero, and
+    beyond it the motor brakes."""
     full, fall = np.array(m.effort_limit), (1 - m.torque_knee) * np.array(m.speed_limit)
     upper, lower = (full * np.clip((m.speed_limit - s * dq) / fall, -1, 1) for s in (1, -1))
     return np.clip(m.kp * (target - q) - m.kd * dq, -lower, upper)
 
 
 def simulate(controller, model, seconds):
-    """Base positions [T, 3] at each control step until the time is over or the robot has fallen."""
+    """Base positions [T, 3] at each control step, until the time is over or the robot falls."""
     m, data = controller.meta, mujoco.MjData(model)
     quat, angvel, q, dq = data.qpos[3:7], data.qvel[3:6], data.qpos[7:], data.qvel[6:]  # views
     q[:], track = m.default_joint_pos, [data.qpos[:3].copy()]
-    model.actuator_forcelimited[:] = 0  # the limits are motor_torque's
-    damping = 0.6 * np.array(m.kd)  # implicit, as the package has it where no limit is reached
+    model.actuator_forcelimited[:] = 0  # motor_torque limits the torque
+    damping = 0.6 * np.array(m.kd)  # integrated implicitly, as in the package away from the limits
     model.actuator_biasprm[:, 2] = -damping
     while len(track) <= round(seconds / m.control_dt) and track[-1][2] > track[0][2] / 2:
         target = controller.targets(quat, angvel, q, dq)
@@ -100,7 +105,7 @@ if __name__ == "__main__":
         parser.error(f"no file '{args.policy}'")
     xbot_l = Path(__file__).resolve().parents[1] / "kslc_jax" / "robots" / "xbot_l.xml"
     model, controller = mujoco.MjModel.from_xml_path(str(xbot_l)), Controller(args.policy, args.vx)
-    model.opt.timestep = 0.001  # at 5 ms the motors alone cannot hold a shank to its speed limit
+    model.opt.timestep = 0.001  # with 5 ms the motors cannot keep a shank within its speed limit
     track, dt = simulate(controller, model, args.seconds), controller.meta.control_dt
     speed = np.diff(track[len(track) // 2 :, 0]).mean() / dt
     print(f"mean forward speed over the second half: {speed:.2f} m/s")

@@ -1,9 +1,10 @@
 """KSLC against its baseline and its ablations: python -m kslc_jax.compare [--seeds 0 1 2]
 
-Trains every variant from scratch, one after the other, KSLC and baseline with every seed, and
-evaluates it over the commanded speeds. Unattended and resumable: what is finished is skipped, what
-was interrupted goes on from its checkpoint. Ends with one table, in Markdown; `python -m
-kslc_jax.plots` draws performance, momentum, and how each speed was learnt.
+Trains every variant from scratch, one after the other, and evaluates it over the commanded speeds.
+KSLC and the baseline train with every seed. The command needs nobody to watch it, and it can be
+repeated: it skips finished runs and resumes interrupted ones from their checkpoints. It ends with
+one Markdown table. `python -m kslc_jax.plots` draws performance, momentum, and the learning curve
+of each speed.
 
 Examples:
   python -m kslc_jax.compare --steps 20000000
@@ -30,19 +31,20 @@ from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError, Fidelity
 
 WIDTH = 200
-"""Columns of the table, whatever the terminal has: to be copied, not torn."""
+"""Width of the table in characters. It does not follow the terminal, so no line breaks."""
 
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to train and how long."""
+    """The trainings, their length, and their evaluation."""
 
     out: Path = Path("runs/compare")
-    """One run folder per variant and seed goes in here."""
+    """Folder for the run folders, one per variant and seed."""
     keep: Path | None = None
-    """Where to copy what table and figures need of all that is finished in `out`, 40 kB a run."""
+    """Folder for copies of the finished runs. A copy has only the data of table and figures: 40 kB
+    a run."""
     variants: tuple[str, ...] = VARIANTS
     """kslc, baseline, and no-PART for each ablation."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -56,13 +58,13 @@ class Args:
     steps: int = 40_000_000
     """Environment steps of each training."""
     snapshots: int = 16
-    """Policies that each keeps on its way, for the learning curves."""
+    """Policies that each training keeps along the way, for the learning curves."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Commanded speeds of the evaluation [m/s]."""
     trials: int = 8
     """Trials per speed."""
     fidelity: Fidelity = "high"
-    """What the evaluation simulates, as `evaluate` has it; high is the same for every preset."""
+    """Physics of the evaluation, as in `evaluate`; high is the same for every preset."""
 
     def __post_init__(self):
         if self.keep and self.keep.resolve() == self.out.resolve():
@@ -88,13 +90,13 @@ class Job:
     variant: str
     seed: int
     folder: Path
-    config: Config  # of the training, but for how long it is and what it keeps
+    config: Config  # of the training; its `run` part is the preset's
     train: tuple[str, ...]  # arguments of kslc_jax.train
     evaluate: tuple[str, ...]  # arguments of kslc_jax.evaluate
 
 
 def jobs(args: Args) -> Iterator[Job]:
-    """All jobs: first seed of every variant first, so that a first table comes early."""
+    """All jobs. Every variant trains its first seed first, so that a first table comes early."""
     for seed in sorted({*args.seeds, *args.ablation_seeds}):
         for variant in args.variants:
             ablation = variant.removeprefix("no-") if variant.startswith("no-") else None
@@ -112,7 +114,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     config = dataclasses.replace(config_lib.preset(preset, parts), seed=seed)
     what = ("--preset", preset, *without, "--seed", str(seed))
     length = ("--steps", str(args.steps), "--run.snapshots", str(args.snapshots))
-    # Told on resume too: train refuses to go on with another preset than it began with.
+    # A resume names its preset too: train refuses it if the run began with another preset.
     resume = ("--resume",) if has_checkpoints(folder) else ()
     run = ("--run-dir", str(folder), *length, *resume)
     speeds = ("--speeds", *map(str, args.speeds))
@@ -123,7 +125,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 
 
 def require_ours(job: Job) -> None:
-    """ConfigError or RunError where the folder holds a training of something else."""
+    """ConfigError or RunError if the folder holds a training with another config."""
     from kslc_jax.training import run_folder
 
     if (job.folder / files.CONFIG).exists():
@@ -131,12 +133,14 @@ def require_ours(job: Job) -> None:
 
 
 def run(job: Job, steps: int) -> bool:
-    """Trains, and evaluates the policies on the way and the last; False where that failed. Each is
-    a process of its own, whose memory and compiled programs are gone with it."""
+    """Trains, then evaluates the snapshots and the last policy; False if a command failed.
+
+    Each command is a separate process, so that its memory is free afterwards.
+    """
     if trained(job.folder) < steps or not (job.folder / files.LEARNING).exists():
         for name in (files.EVALUATION, files.LEARNING):
-            (job.folder / name).unlink(missing_ok=True)  # not of what is trained now
-        # A training that was stopped by a signal has saved, and says that all is well.
+            (job.folder / name).unlink(missing_ok=True)  # results of the shorter training
+        # A training that a signal stopped has saved, and returns exit code 0 too.
         if not (call("train", job.train) and trained(job.folder) >= steps):
             return False
         if not call("learning", (str(job.folder),)):
@@ -145,7 +149,7 @@ def run(job: Job, steps: int) -> bool:
 
 
 def trained(run: Path) -> int:
-    """Environment steps that a run folder has seen; 0 where it says none."""
+    """Environment steps of a run folder, by its metrics; 0 if it has none."""
     try:
         return int(plots.read_metrics(run)["env_steps"][-1])
     except ValueError:
@@ -153,7 +157,7 @@ def trained(run: Path) -> int:
 
 
 def is_done(job: Job, args: Args) -> bool:
-    """Whether the folder holds the evaluation that is asked for, of a training of that length."""
+    """True if the folder holds this evaluation, and its training has at least `args.steps`."""
     try:
         kept = json.loads((job.folder / files.EVALUATION).read_text())
         speeds = tuple(row["command"] for row in kept["rows"])
@@ -165,8 +169,11 @@ def is_done(job: Job, args: Args) -> bool:
 
 
 def call(module: str, arguments: tuple[str, ...]) -> bool:
-    """Whether a command of this package succeeded. At Ctrl-C, which it hears too, and at SIGTERM,
-    which is passed on, it is given the time to save; then KeyboardInterrupt."""
+    """Runs a command of this package; True if it succeeded.
+
+    A signal leaves the child time to save; then this function raises KeyboardInterrupt. The
+    terminal sends Ctrl-C to the child too. SIGTERM is passed on to it.
+    """
     process = subprocess.Popen([sys.executable, "-m", f"kslc_jax.{module}", *arguments])
 
     def terminate(number: int, _: FrameType | None) -> None:
@@ -184,7 +191,7 @@ def call(module: str, arguments: tuple[str, ...]) -> bool:
 
 
 def finished(out: Path) -> list[Path]:
-    """Run folders that have been evaluated, in the order of `VARIANTS`."""
+    """The run folders with an evaluation, in the order of `VARIANTS`."""
 
     def place(run: Path) -> tuple[int, str]:
         variant, _, _ = run.name.rpartition("-seed")
@@ -194,9 +201,11 @@ def finished(out: Path) -> list[Path]:
 
 
 def keep(run: Path, folder: Path) -> None:
-    """Copies a finished run's config, versions and evaluation, and what `plots` reads of its
-    learning curves and of its metrics: every tenth record, and those at which the range of commands
-    grew."""
+    """Copies config, versions and evaluation of a finished run, and the data that `plots` reads.
+
+    Of the metrics it copies every tenth record, those at which the range of commands grew, and the
+    last one.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for name in (files.CONFIG, files.VERSIONS, files.EVALUATION):
         files.write_atomically(folder / name, (run / name).read_text())
@@ -216,8 +225,10 @@ def _short(x: float) -> float:
 
 
 def table(runs: Sequence[Path]) -> Table:
-    """Per run its length, the range of commands that it reached and when, and per command its mean
-    forward speed [m/s], or 'falls' where a trial fell."""
+    """One row per run: its length, the range of commands that it reached, and after how long.
+
+    Then, per command, the mean forward speed [m/s], or 'falls' if a trial fell.
+    """
     shown = Table(box=box.MARKDOWN)
     for header in ("run", "steps", "v_max [m/s]", "after"):
         shown.add_column(header, no_wrap=True)
@@ -247,7 +258,10 @@ def _reached(run: Path) -> tuple[str, str, str]:
 
 
 def report(args: Args, refused: Sequence[str]) -> None:
-    """The table of what is finished, and a copy where one is wanted; OSError, ValueError."""
+    """Prints the table of the finished runs and, with --keep, copies them.
+
+    OSError or ValueError if a file of a run is not readable.
+    """
     done = [run for run in finished(args.out) if run.name not in refused]
     if done:
         print("mean forward speed [m/s] per command:")
@@ -258,7 +272,10 @@ def report(args: Args, refused: Sequence[str]) -> None:
 
 
 def run_all(args: Args) -> tuple[list[str], list[str]]:
-    """Does what is not done before; the names of what failed, and of what is something else."""
+    """Runs the jobs that are not done.
+
+    Returns (the jobs that failed, the jobs whose folder holds another training), by name.
+    """
     from kslc_jax.training.run_folder import RunError
 
     failed, refused = [], []
@@ -286,7 +303,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _compare(args: Args) -> int:
-    """Does it all and reports; the exit code."""
+    """Runs all jobs and reports; returns the exit code."""
     if args.keep:
         files.require_writable(args.keep / files.EVALUATION)
     try:

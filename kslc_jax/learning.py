@@ -1,8 +1,8 @@
-"""How each commanded speed was learnt: python -m kslc_jax.learning RUN [RUN ...]
+"""Learning curves of each commanded speed: python -m kslc_jax.learning RUN [RUN ...]
 
-Tries the policies that a training kept on its way (--run.snapshots) at fixed commands, in the
-training engine, and writes learning.json into the run folder; python -m kslc_jax.plots learning
-draws it, several seeds of one method together.
+Evaluates the policies that a training kept along the way (--run.snapshots). They run at fixed
+commands in the training engine. Writes learning.json into the run folder. `python -m kslc_jax.plots
+learning` draws it, and puts several seeds of one method together.
 
 Examples:
   python -m kslc_jax.learning runs/laptop-seed0 runs/laptop-seed1
@@ -24,7 +24,7 @@ from kslc_jax.config import ConfigError
 
 @dataclass(frozen=True)
 class Args:
-    """What to try."""
+    """The runs, and the trials of their policies."""
 
     runs: Paths
     """Run folders."""
@@ -33,7 +33,7 @@ class Args:
     seeds: int = 4
     """Trials per speed and policy."""
     seconds: float = 10.0
-    """Length of a trial."""
+    """Length of a trial [s]."""
 
     def __post_init__(self):
         if not self.runs:
@@ -42,7 +42,7 @@ class Args:
 
 
 def snapshots(run: Path) -> list[Path]:
-    """The policies that a run kept, oldest first; ConfigError where there is none."""
+    """The policies that a run kept, oldest first; ConfigError if there is none."""
     found = sorted((p for p in run.glob(f"{files.SNAPSHOTS}/*") if p.name.isdigit()), key=_step)
     if not found:
         raise ConfigError(f"{run} holds no snapshots (trained with --run.snapshots 0?)")
@@ -56,7 +56,13 @@ def _step(folder: Path) -> int:
 def curve(
     run: Path, args: Args, progress: Callable[[float], None] = lambda share: None
 ) -> dict[str, Any]:
-    """The content of learning.json: per snapshot, the speeds' survival and tracking."""
+    """The content of learning.json: per snapshot, survival and tracking at each speed.
+
+    Args:
+      run: run folder.
+      args: speeds, number and length of the trials.
+      progress: called with the share [] that is done.
+    """
     from kslc_jax.evaluation import gait_metrics, trials
     from kslc_jax.evaluation.measure import measure
     from kslc_jax.policy import load_policy
@@ -89,7 +95,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _write(args: Args) -> None:
-    """Tries the policies of every run and writes what it found into the run folders."""
+    """Evaluates the policies of every run and writes learning.json into the run folders."""
     for run in args.runs:
         snapshots(run)
     with Progress(transient=True) as bar:

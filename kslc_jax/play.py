@@ -1,10 +1,10 @@
 """Watch a policy: python -m kslc_jax.play POLICY
 
-Opens a live viewer in the browser: sliders command the robot while it runs. With --gait-strip or
---video it draws, off screen, the paper's gait figure (the robot every 0.25 s on a 1 m grid, one
-strip per speed) or a film of one speed after the other instead. Full C MuJoCo at high fidelity
-unless told otherwise; strips and films also in Drake. POLICY is a run folder, a checkpoint folder,
-or a shipped policy's name.
+Opens a live viewer in the browser: sliders command the robot while it runs. The options
+--gait-strip and --video draw off screen instead. --gait-strip draws the paper's gait figure: the
+robot every 0.25 s on a 1 m grid, one strip per speed. --video makes a film of one speed after the
+other. The default physics is C MuJoCo at high fidelity; strips and films can also use Drake. POLICY
+is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
 
 import contextlib
@@ -27,40 +27,42 @@ FPS = 50
 STRIPS = (".png", ".jpg")
 FILMS = (".mp4", ".mkv", ".mov")
 ANIMATIONS = (".webp", ".gif")
-"""Films that web pages show like pictures. They need no ffmpeg and have half the frames."""
+"""Suffixes of films that web pages show like pictures. They need no ffmpeg. They have half the
+frames."""
 
 QUALITY = 60
-"""Quality of an animation, 0 to 100: six seconds take about 1 MB."""
+"""Quality of an animation, 0 to 100. With it, six seconds take about 1 MB."""
 
 SPEED_SECONDS = 0.5
-"""Span over which the speed written into the video is taken."""
+"""Window for the mean speed that the video shows as text [s]."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to watch, and how."""
+    """The policy, and the way to watch it."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
     fidelity: Fidelity = "high"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
     engine: sim2sim.Engine = "mujoco"
-    """What simulates strip and video; drake needs its package (pip install 'kslc_jax[drake]')."""
+    """Physics engine of strip and video; drake is an extra (pip install 'kslc_jax[drake]')."""
     seed: int = 0
-    """Of the initial state."""
+    """Seed of the initial state."""
     host: str = "127.0.0.1"
-    """Address of the viewer. The default is reached from this machine only; 0.0.0.0 from all."""
+    """Address of the viewer. Only this machine reaches the default; every machine reaches
+    0.0.0.0."""
     port: int = 8080
-    """Port of the viewer; 0 takes any that is free."""
+    """Port of the viewer; 0 takes any free port."""
     speeds: tuple[float, ...] = (2.0, 3.5)
     """Commanded forward speeds of strip and video [m/s]."""
     seconds: float = 2.0
-    """Time shown per speed in strip and video, after some seconds to gather speed."""
+    """Time that strip and video show per speed. It starts after the robot has gathered speed."""
     gait_strip: Path | None = None
-    """PNG to write: one strip per speed."""
+    """PNG or JPG to write: one strip per speed."""
     video: Path | None = None
-    """Film to write, one speed after the other. MP4, MKV and MOV need the package imageio-ffmpeg
-    (pip install 'kslc_jax[video]'); WEBP and GIF need nothing more."""
+    """Film to write: one speed after the other. MP4, MKV and MOV need the package imageio-ffmpeg
+    (pip install 'kslc_jax[video]'). WEBP and GIF need no more packages."""
 
     def __post_init__(self):
         if not 0 < self.seconds < math.inf:
@@ -80,7 +82,7 @@ class Args:
 
     @property
     def live(self) -> bool:
-        """Whether to open the viewer."""
+        """True if the command opens the viewer."""
         return self.gait_strip is None and self.video is None
 
 
@@ -88,7 +90,7 @@ class Args:
 
 
 def record(args: Args, policy, settle: float = 4.0):
-    """Trace [T, S, ...], the step at which `settle` seconds are over, and the control step [s]."""
+    """(trace [T, S, ...], number of steps in `settle` seconds, length of a control step [s])."""
     import jax
     import numpy as np
 
@@ -109,8 +111,11 @@ def record(args: Args, policy, settle: float = 4.0):
 
 
 def shown(alive, start: int) -> range:
-    """The steps to show of one trial [T]: those after `start`; of one that fell, as many that end
-    with its fall."""
+    """The steps of one trial to show, from `alive` [T].
+
+    These are the steps from `start` on. If the robot fell, they are as many steps, or all if there
+    are fewer, up to its fall.
+    """
     steps = len(alive)
     fall = steps if alive[-1] else int(alive.argmin())
     return range(max(0, fall - (steps - start)), fall) if fall else range(1)
@@ -135,18 +140,20 @@ def caption(picture, text: str):
 
 
 def film_writer():
-    """The module imageio; MissingPackage that says what to install."""
+    """The module imageio; if it is missing, MissingPackage says what to install."""
     try:
         import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401 (imageio would say less clearly that it is missing)
+        import imageio_ffmpeg  # noqa: F401 (its own error is clearer than imageio's)
     except ImportError as error:
         raise MissingPackage(f"films: {error} (pip install 'kslc_jax[video]')") from error
     return imageio
 
 
 def film(args: Args, trace, spans: Sequence[range], every: int, dt: float) -> Iterator:
-    """Pictures [H, W, 3] of every `every`-th step of the spans, one speed after the other, with the
-    commanded and the actual speed written into them."""
+    """Pictures [H, W, 3] of every `every`-th step of the spans, one speed after the other.
+
+    Each picture shows the commanded and the actual speed as text.
+    """
     from kslc_jax.viewer import render
 
     window = round(SPEED_SECONDS / dt)
@@ -159,13 +166,13 @@ def film(args: Args, trace, spans: Sequence[range], every: int, dt: float) -> It
 
 
 def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
-    """Writes the film at real time; the suffix of `path` decides the format."""
+    """Writes the film, which plays in real time. The suffix of `path` decides the format."""
     if path.suffix.lower() in ANIMATIONS:
         every = max(1, round(2.0 / (FPS * dt)))
         write_animation(path, film(args, trace, spans, every, dt), every * dt)
         return
     imageio = film_writer()
-    # ffmpeg is started in a process of its own at once: nothing of JAX runs in the fork.
+    # The warning is harmless here: the fork starts ffmpeg at once and runs no JAX.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
     every = max(1, round(1.0 / (FPS * dt)))
     with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as out:
@@ -174,7 +181,7 @@ def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float
 
 
 def write_animation(path: Path, pictures: Iterable, seconds: float) -> None:
-    """Writes an animated WebP or GIF that repeats for ever; each picture lasts `seconds`."""
+    """Writes an animated WebP or GIF that repeats without end; each picture lasts `seconds`."""
     from PIL import Image
 
     first, *others = map(Image.fromarray, pictures)
@@ -184,7 +191,7 @@ def write_animation(path: Path, pictures: Iterable, seconds: float) -> None:
 
 
 def draw(args: Args, policy) -> None:
-    """Writes the gait strip and the video that were asked for."""
+    """Writes the gait strip and the video that `args` names."""
     import matplotlib.image
 
     from kslc_jax.viewer import render
@@ -211,7 +218,7 @@ def draw(args: Args, policy) -> None:
 
 
 def is_local(host: str) -> bool:
-    """Whether an address is reached from this machine only."""
+    """True if only this machine reaches the address."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -244,7 +251,7 @@ def _play(args: Args) -> None:
         watch(args)
         return
     runtime.choose_gl()  # before anything that imports mujoco
-    sim2sim.simulator(args.engine)  # what is not installed is told at once
+    sim2sim.simulator(args.engine)  # fails now if the engine's package is missing
     from kslc_jax.policy import load_policy
 
     draw(args, load_policy(args.policy))

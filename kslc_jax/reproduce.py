@@ -1,8 +1,9 @@
-"""Do this machine's numbers agree with the published ones? python -m kslc_jax.reproduce [POLICY]
+"""Compare this machine's numbers with the published ones: python -m kslc_jax.reproduce [POLICY]
 
-Evaluates a shipped policy again, under the conditions of its stored evaluation, and compares each
-number with its band. With --train it trains the policy's preset from scratch as well and compares
-when the range of commanded speeds grew. Exit code 1 where a number lies outside its band.
+Evaluates a shipped policy again, under the conditions of its stored evaluation. Each number must
+lie within a band around its stored value. With --train it also trains the policy's config from
+scratch, and compares the environment steps at which the range of commanded speeds grew. The exit
+code is 1 if a number lies outside its band.
 
 Examples:
   python -m kslc_jax.reproduce                   # minutes
@@ -37,39 +38,39 @@ BANDS = {
     "flight_share": 0.05,
     "shoulder_hip_correlation": 0.1,
 }
-"""How far a metric may be from its stored value, in its own unit."""
+"""Largest allowed difference between a metric and its stored value, in the metric's unit."""
 
 LATER = 1.5
-"""A milestone may need this many times the stored environment steps: seeds differ by as much."""
+"""Allowed factor on the environment steps of a milestone: seeds differ by about as much."""
 
 
 class Stopped(RuntimeError):
-    """The training was stopped by a signal, and has saved."""
+    """A signal stopped the training; it has saved its state."""
 
 
 Row = tuple[str, float, float, bool]
-"""(what, stored, found, agrees)"""
+"""(description, stored value, value found here, True if they agree)"""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to repeat."""
+    """The policy to evaluate again, and its training."""
 
     policy: tyro.conf.Positional[str] = SHIPPED
     """Name of a shipped policy."""
     train: bool = False
-    """Train from scratch too."""
+    """Also train from scratch."""
     seed: int = 0
-    """Of the training."""
+    """Seed of the training."""
     run_dir: Path = Path("runs/reproduce")
-    """Where the training goes."""
+    """Run folder of the training."""
 
     def __post_init__(self):
         config_lib.require_seed(self.seed)
 
 
 def stored(folder: Path, name: str) -> dict[str, Any]:
-    """A JSON file of a shipped policy; ConfigError if it has none."""
+    """The content of a JSON file in the folder of a policy; ConfigError if it is not readable."""
     try:
         return json.loads((folder / name).read_text())
     except (OSError, ValueError) as error:
@@ -77,7 +78,7 @@ def stored(folder: Path, name: str) -> dict[str, Any]:
 
 
 def compare_rows(old: list[dict[str, float]], new: list[dict[str, float]]) -> list[Row]:
-    """Every banded metric of every commanded speed."""
+    """One row for each metric of `BANDS` and each commanded speed."""
     out = []
     for before, now in zip(old, new, strict=True):
         for name in (n for n in BANDS if n in before):
@@ -88,7 +89,7 @@ def compare_rows(old: list[dict[str, float]], new: list[dict[str, float]]) -> li
 
 
 def compare_milestones(old: dict[str, float], new: dict[str, float]) -> list[Row]:
-    """Millions of environment steps until commands reached each speed."""
+    """One row for each speed: millions of environment steps until the commands reached it."""
     out = []
     for speed, steps in old.items():
         found = new.get(speed, float("inf"))
@@ -98,8 +99,11 @@ def compare_milestones(old: dict[str, float], new: dict[str, float]) -> list[Row
 
 
 def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
-    """Trains `config` from scratch, or goes on with it, for `until` environment steps; returns
-    those at which each speed [m/s] was reached. Raises as `loop.train`, and Stopped."""
+    """Trains `config` up to `until` environment steps: from scratch, or from its checkpoint.
+
+    Returns the environment steps at which the commands reached each speed [m/s]. Raises the errors
+    of `loop.train`, and Stopped.
+    """
     from kslc_jax import plots
     from kslc_jax.checkpoint_format import has_checkpoints
     from kslc_jax.training import loop
@@ -116,7 +120,7 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
 
 
 def report(rows: list[Row], title: str) -> Table:
-    """What was compared."""
+    """The compared numbers as a table."""
     out = Table(title=title, title_justify="left")
     for column in ("what", "published", "here", ""):
         out.add_column(column, justify="left" if column == "what" else "right")
@@ -126,7 +130,10 @@ def report(rows: list[Row], title: str) -> Table:
 
 
 def repeat(args: Args) -> list[Row]:
-    """Everything that was asked for; ConfigError, CheckpointError or RunError where it cannot."""
+    """Evaluates, and with --train trains; prints a table of each and returns the rows.
+
+    Errors: ConfigError, CheckpointError, and with --train those of `retrain`.
+    """
     from kslc_jax.policy import POLICIES, load_policy
 
     policy = load_policy(args.policy)
@@ -162,7 +169,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _compare(args: Args) -> int:
-    """The exit code: 1 where a number lies outside its band."""
+    """Compares and reports; the exit code is 1 if a number lies outside its band."""
     if args.train:
         runtime.require_good_jax()
     try:

@@ -1,4 +1,4 @@
-"""Shared fixtures. Tests run on the CPU in float32, as training does there."""
+"""Shared fixtures. Tests run in float32, as training does on the CPU."""
 
 import os
 
@@ -8,7 +8,7 @@ import pytest
 
 from kslc_jax import config, robot, runtime
 
-runtime.quiet()  # as in a command: saves that fail on purpose leave no stray tracebacks
+runtime.quiet()  # as commands do; else saves that fail on purpose print tracebacks
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Trainings in processes of their own, which see as many CPU devices as they are told."""
+"""Starts trainings in child processes that see a chosen number of CPU devices."""
 
 import contextlib
 import json
@@ -22,11 +22,11 @@ METRICS = dict.fromkeys(
     ],
     0.5,
 )
-"""As a train step gives them, as far as loop, recorder and progress read them."""
+"""The metrics of a train step that loop, recorder and progress read, with made-up values."""
 
 
 def command(*args: Any, forced: int) -> dict[str, Any]:
-    """Arguments of subprocess for a Python that sees `forced` devices."""
+    """Arguments of `subprocess` that run Python with `forced` CPU devices."""
     flags = f"--xla_force_host_platform_device_count={forced}"
     return {
         "args": [sys.executable, *map(str, args)],
@@ -44,7 +44,10 @@ def free_port() -> int:
 
 
 def started(stack: contextlib.ExitStack, *args: Any, processes: int = 2, forced: int = 2) -> list:
-    """Processes of one training, of `forced` devices each; killed with the stack's end."""
+    """Starts the processes of one training, each with `forced` devices.
+
+    The end of `stack` kills them.
+    """
     options = ["--coordinator", f"127.0.0.1:{free_port()}", "--processes", processes]
     options += ["--devices", forced, "--process-index"]
     running = []
@@ -56,15 +59,17 @@ def started(stack: contextlib.ExitStack, *args: Any, processes: int = 2, forced:
 
 
 def ended(processes: list, code: int = 0, within: float = 5000.0) -> list[tuple[str, str]]:
-    """What they say on (stdout, stderr), once all have ended with this exit code; without what
-    XLA's way between CPUs prints."""
+    """Waits until all processes have ended with this exit code; returns each (stdout, stderr).
+
+    The output is without the lines of Gloo, which XLA uses between CPU processes.
+    """
     said = [process.communicate(timeout=within) for process in processes]
     assert [process.returncode for process in processes] == [code] * len(processes), said
     return [(re.sub(r"(?m)^\[Gloo\].*\n", "", out), err) for out, err in said]
 
 
 def alone(*args: Any, devices: int = 1) -> str:
-    """What one process says that has ended well."""
+    """Runs one process, which must end with exit code 0; returns its stdout."""
     how = command(*args, "--devices", devices, forced=devices)
     done = subprocess.run(**how, timeout=5000, check=False)
     assert done.returncode == 0, done.stderr

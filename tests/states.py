@@ -1,4 +1,4 @@
-"""Hand-made states: one robot standing upright at rest, with named changes."""
+"""Hand-made states: one robot that stands upright at rest, with named changes."""
 
 import dataclasses
 from typing import Any
@@ -23,7 +23,7 @@ def _array(value: Any) -> Any:
 
 
 def make_signals(**changes: Any) -> Signals:
-    """Base 0.89 m above the soles, feet 0.3 m and knees 0.22 m apart, both feet on the ground."""
+    """Base height 0.89 m, feet 0.3 m and knees 0.22 m apart, both feet on the ground."""
     defaults = dict(
         joint_pos=np.zeros(16),
         joint_vel=np.zeros(16),
@@ -46,7 +46,7 @@ def make_signals(**changes: Any) -> Signals:
 
 
 def make_gait(**changes: Any) -> GaitState:
-    """Phase 0: both feet are to stand, and do."""
+    """Phase 0: the clock has both feet on the ground, and both feet touch it."""
     defaults = dict(
         phase=0.0,
         contact=[True, True],
@@ -62,12 +62,12 @@ def make_gait(**changes: Any) -> GaitState:
 
 
 def make_command(**changes: Any) -> Command:
-    """Zero velocity, with the clock running."""
+    """Zero velocity; the clock runs."""
     return _fill(Command, dict(velocity=np.zeros(3), heading=0.0, moving=True), changes)
 
 
 def joints(**values: float) -> np.ndarray:
-    """[16] with the named joints' values, by hand-written index."""
+    """Joint vector [16] with the given values at the named joints; the order is typed by hand."""
     order = [
         *("left_leg_roll", "left_leg_yaw", "left_leg_pitch", "left_knee"),
         *("left_ankle_pitch", "left_ankle_roll"),

@@ -1,5 +1,5 @@
-"""What a person may get wrong at the command lines: exit code 2, a line that names it, no
-traceback, and nothing on disk touched."""
+"""Bad input to the commands: exit code 2, one line that names the error, no traceback, and no
+change on disk."""
 
 import contextlib
 import copy
@@ -46,23 +46,24 @@ words = st.text(string.ascii_letters, min_size=4, max_size=8).filter(
 
 
 def refused(main, *argv: Any) -> str:
-    """What stderr says of a command line that is refused."""
+    """The text on stderr of a command that must refuse its arguments."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             code = main([str(a) for a in argv])
-        except SystemExit as stop:  # tyro's way
+        except SystemExit as stop:  # tyro raises it
             code = stop.code
     said = err.getvalue()
     assert code == 2 and "Traceback" not in said
-    if said.startswith("error: "):  # else it is a box of tyro's
+    if said.startswith("error: "):  # else tyro printed it in a box
         assert len(said.splitlines()) == 1
     return said
 
 
 @pytest.fixture(autouse=True)
 def no_training(monkeypatch):
-    """A train step that cannot run: accepting bad input shows as an AttributeError."""
+    """Replaces the train step by None. If a command accepts bad input, it fails with an
+    AttributeError."""
     monkeypatch.setattr(
         train_step, "make", lambda config: (lambda: train_step.init(config, config.seed), None)
     )
@@ -70,7 +71,7 @@ def no_training(monkeypatch):
 
 @pytest.fixture
 def run_dir(tmp_path):
-    """A folder whose name is not easy, with a config that can be damaged."""
+    """An empty folder whose name has a space, quotes and characters beyond ASCII."""
     folder = tmp_path / "läuft gut 机器人 'x'"
     folder.mkdir()
     return folder
@@ -118,7 +119,7 @@ class TestTrain:
     def test_unknown_names(self, run_dir, word):
         assert word in refused(train.main, "--preset", word, "--run-dir", run_dir / "new")
         assert word in self.refused(run_dir, "--without", word)
-        assert word in self.refused(run_dir, f"--of-{word}", "1")  # "--seed" would be one
+        assert word in self.refused(run_dir, f"--of-{word}", "1")  # "--seed" would be an option
         assert word in self.refused(run_dir, "--physics.engine", word)
 
     def test_profile_and_devices(self, run_dir):
@@ -219,7 +220,7 @@ class TestStoredConfig:
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    """A run folder with one checkpoint of zeros, under a path with a space and beyond ASCII."""
+    """A run folder with one checkpoint of zeros. Its path has a space and non-ASCII characters."""
     config = preset("debug")
 
     def zeros(x):
@@ -246,7 +247,7 @@ COMMANDS = [(evaluate.main, ()), (sim2sim.main, ()), (play.main, PICTURE)]
 class TestPolicyCommands:
     @pytest.fixture(autouse=True)
     def any_renderer(self, monkeypatch):
-        """None is reached, so that it does not matter which this machine has."""
+        """Sets a renderer. No test here draws, so the machine need not have it."""
         monkeypatch.setenv("MUJOCO_GL", "egl")
 
     @few
@@ -316,8 +317,8 @@ def test_at_least_one_path_is_asked_for(main, figure, capsys):
 def test_what_a_link_points_to_is_written(tmp_path):
     link, target = tmp_path / "latest.json", tmp_path / "there" / "kept.json"
     link.symlink_to(target)
-    files.require_writable(link)  # makes the folder that the link leads to
-    for rows in ([1], [2]):  # not there yet, and again
+    files.require_writable(link)  # makes the folder of the link's target
+    for rows in ([1], [2]):  # first a new file, then an existing one
         files.write_json(link, {"rows": rows})
         assert link.is_symlink() and json.loads(target.read_text()) == {"rows": rows}
     assert list(target.parent.iterdir()) == [target]
@@ -338,7 +339,7 @@ class TestPlay:
         assert word in refused(play.main, policy, option, run_dir / f"x.{word}")
 
     def test_drake_is_not_installed(self, monkeypatch, tmp_path):
-        """Told before the policy is looked for."""
+        """The command says so before it looks for the policy."""
         monkeypatch.setitem(sys.modules, "kslc_jax.evaluation.drake", None)
         assert "kslc_jax[drake]" in refused(play.main, tmp_path, *PICTURE, "--engine", "drake")
 

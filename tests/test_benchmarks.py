@@ -1,4 +1,4 @@
-"""The benchmarks: that both sides do the same work, and that all of them run."""
+"""The benchmarks: the compared programs do the same work, and all benchmarks run."""
 
 import gzip
 import json
@@ -41,7 +41,8 @@ def test_parts_add_up():
 
 
 def test_timeline_of_a_trace(tmp_path):
-    """Only operations that consist of no others count; seconds, from the first one's start."""
+    """Operations that contain other operations do not count. Times are in seconds from the start of
+    the first operation."""
 
     def event(name, start, length, thread=1, **args):
         return {"ph": "X", "name": name, "ts": start, "dur": length, "tid": thread, "args": args}
@@ -87,7 +88,7 @@ def test_ratios_are_of_each_turn():
 
 @pytest.mark.slow(reason="compiles a second train step")
 def test_purejaxrls_loop_learns_the_same(debug):
-    """Stored and shuffled observations, or windows gathered from frames: the same parameters."""
+    """Stored and shuffled observations give the same parameters as windows gathered from frames."""
     ours, theirs = train_step.make(debug), purejaxrl.make(debug)
     for init, step in (ours, theirs):
         state = init()
@@ -102,7 +103,7 @@ def test_purejaxrls_loop_learns_the_same(debug):
 
 
 def test_gym_environment_is_the_same_robot(debug):
-    """Physics, motors and frames of the hand-written environment equal ours."""
+    """Physics, motors and frames of the Gymnasium environment equal those of the package."""
     pytest.importorskip("gymnasium", reason="an extra, needed by one benchmark only")
     from benchmarks.gym_env import XBot
 
@@ -147,7 +148,7 @@ def test_gym_environment_is_the_same_robot(debug):
 
 @pytest.mark.slow(reason="compiles three programs")
 def test_throughput(tmp_path):
-    """Physics alone is faster than the rollout, and that than training."""
+    """Physics alone is faster than the rollout; the rollout is faster than training."""
     path = tmp_path / "numbers.json"
     throughput.main(throughput.Args(preset="debug", repeats=3, engines=("mujoco",), json=path))
     rates = json.loads(path.read_text())["steps_per_second"]["mujoco"]
@@ -188,7 +189,7 @@ def test_compile_time_and_memory(tmp_path, capsys):
 
 @pytest.mark.slow(reason="compiles MJX, a minute on two cores")
 def test_gpu_in_small(tmp_path):
-    """On any machine: a rate for each part of each case, and for the other precision."""
+    """On any machine: one rate for each part of each case, and one for the other precision."""
     cases, parts = ("mjx:16x8", "mujoco:32x4"), ("physics only", "whole training")
     out = tmp_path / "gpu.json"
     gpu.main(gpu.Args(out, "debug", cases, parts, ("float32",), repeats=1))

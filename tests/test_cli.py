@@ -1,4 +1,4 @@
-"""What all commands share: one line for an error, its exit code, and a process left as it was."""
+"""Behaviour of all commands: one line for an error, its exit code, process-wide settings."""
 
 import logging
 import os
@@ -62,7 +62,7 @@ def hooks():
 
 
 def test_preparing_leaves_hooks_and_logs_alone(process):
-    """It is called in notebooks and scripts, which are not ours."""
+    """Notebooks and scripts of users call it too."""
     before = hooks()
     runtime.prepare()
     assert hooks() == before
@@ -79,7 +79,7 @@ def test_a_command_silences_its_process(process):
     [(("EGL", "OSMesa"), "egl"), (("OSMesa",), "osmesa"), ((), None)],
 )
 def test_preparing_chooses_the_gl_that_is_there(there, chosen, monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "")  # to be restored, whatever is chosen
+    monkeypatch.setenv("MUJOCO_GL", "")  # monkeypatch restores it after the test
     find = lambda name: f"lib{name}.so" if name in there else None  # noqa: E731
     monkeypatch.setattr(runtime.ctypes.util, "find_library", find)
     runtime.prepare(gl=False)

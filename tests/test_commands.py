@@ -1,4 +1,4 @@
-"""Commands: dead zone, heading, narrowing and standing still, with ranges of one value."""
+"""Commands: dead zone, heading, narrowing, standing still, and shares of slow commands."""
 
 import dataclasses
 
@@ -18,7 +18,7 @@ KEY = jax.random.key(0)
 
 
 def draw(vx=0.0, vy=0.0, heading=0.0, yaw=0.0, **changes):
-    """The command drawn from ranges that hold one value."""
+    """A command drawn from ranges with one value each."""
     config = dataclasses.replace(PAPER, vy=(vy, vy), heading=(heading, heading), **changes)
     return commands.sample(config, KEY, (jnp.asarray(vx), jnp.asarray(vx)), jnp.asarray(yaw), 0.5)
 
@@ -58,7 +58,7 @@ def test_heading_error_becomes_a_yaw_rate(heading, yaw, rate):
     command = draw(1.0, 0.0, heading, yaw)
     np.testing.assert_allclose(command.velocity, [1.0, 0.0, rate], atol=1e-6)
     assert float(command.heading) == pytest.approx(heading)
-    # The same once more from the next yaw: nothing accumulates.
+    # Again from the next yaw: nothing accumulates.
     turned = jax.jit(lambda c, y: commands.steer(PAPER, c, y))(command, jnp.asarray(heading))
     np.testing.assert_allclose(turned.velocity, [1.0, 0.0, 0.0], atol=1e-6)
 
@@ -74,22 +74,23 @@ def test_gain_and_limit_of_the_yaw_rate_are_the_configs():
 @pytest.mark.parametrize(
     ("vx", "vy", "heading"),
     [
-        (0.0, 0.3, 2.0),  # all of it
+        (0.0, 0.3, 2.0),  # the full range
         (2.0, 0.15, 1.5),  # half: 1 + (2 - 1) / 2
         (-1.0, 0.225, 1.75),  # three quarters
-        (4.0, 0.0, 1.0),  # nothing
+        (4.0, 0.0, 1.0),  # no range
         (6.0, 0.0, 1.0),
     ],
 )
 def test_fast_commands_are_narrow(vx, vy, heading):
-    """With narrow_speed 4 and yaw 1, of vy 0.3 and heading 2 the share 1 - |vx| / 4 is left."""
+    """vy and heading - yaw keep the share 1 - |vx| / 4. Here narrow_speed is 4 m/s, yaw 1 rad, vy
+    0.3 m/s and heading 2 rad."""
     command = draw(vx, 0.3, 2.0, 1.0, narrow_speed=4.0)
     np.testing.assert_allclose(command.velocity[:2], [vx, vy], atol=1e-6)
     assert float(command.heading) == pytest.approx(heading, abs=1e-6)
 
 
 def test_narrowing_turns_the_short_way():
-    """From yaw 3 to heading -3 it is 0.2831853; half of that on top of 3."""
+    """The short way from yaw 3 to heading -3 is 0.2831853 rad; half of it is added to 3."""
     command = draw(2.0, 0.0, -3.0, 3.0, narrow_speed=4.0)
     assert float(command.heading) == pytest.approx(3.1415927, abs=1e-6)
     assert float(command.velocity[2]) == pytest.approx(0.5 * 0.1415927, abs=1e-6)
@@ -101,7 +102,7 @@ def test_no_narrowing_by_default():
 
 
 def test_stand_commands():
-    """Zero velocity, the heading it has; with `stand_still` the clock may stop."""
+    """Zero velocity and the present heading. The clock stops only with `stand_still`."""
     command = draw(3.0, 0.0, 2.0, 1.0, stand_fraction=1.0, stand_still=True)
     assert command.velocity.tolist() == [0.0, 0.0, 0.0]
     assert float(command.heading) == 1.0 and not bool(command.moving)
@@ -115,7 +116,7 @@ def test_forward_commands_have_no_side_speed():
 
 
 def test_forward_commands_keep_the_heading():
-    """config.CommandConfig.forward_fraction: straight ahead, heading as it is."""
+    """CommandConfig.forward_fraction: straight ahead, with the present heading."""
     command = draw(1.0, 0.3, 2.0, 1.0, forward_fraction=1.0)
     assert float(command.heading) == pytest.approx(1.0)
     np.testing.assert_allclose(command.velocity, [1.0, 0.0, 0.0], atol=1e-6)
@@ -126,11 +127,11 @@ def test_forward_commands_keep_the_heading():
     [
         ((-0.3, 3.5), 0.35, 1.0),
         ((-0.3, 0.5), 0.1, 0.5),  # the whole range is slow
-        ((1.5, 3.5), 1.5, 1.5),  # none of it
+        ((1.5, 3.5), 1.5, 1.5),  # no part of the range is slow
     ],
 )
 def test_slow_commands(vx, mean, most):
-    """Uniform from the range's lower end to `slow_speed`, within the range."""
+    """Slow commands are uniform from the range's lower end to `slow_speed`, within the range."""
     config = dataclasses.replace(PAPER, dead_zone=0.0, slow_fraction=1.0, slow_speed=1.0)
     speeds = np.asarray(draw_many(config, vx=vx).velocity[:, 0])
     assert speeds.mean() == pytest.approx(mean, abs=0.02)
@@ -139,7 +140,7 @@ def test_slow_commands(vx, mean, most):
 
 
 def test_a_share_of_the_commands_is_slow():
-    """A quarter of them, beside the 1.3 of 3.8 m/s that are slow anyway: 0.507."""
+    """A quarter is drawn slow. Of the rest, 1.3 / 3.8 is slow by chance: 0.507 in all."""
     config = dataclasses.replace(PAPER, dead_zone=0.0, slow_fraction=0.25, slow_speed=1.0)
     speeds = np.asarray(draw_many(config).velocity[:, 0])
     assert (speeds < 1.0).mean() == pytest.approx(0.25 + 0.75 * 1.3 / 3.8, abs=0.03)
@@ -152,7 +153,7 @@ def test_a_share_of_the_commands_is_slow():
         ([0.0, -0.3, 0.05], True, [0.0, -0.3, 0.05]),
         ([0.0, 0.0, 0.11], True, [0.0, 0.0, 0.11]),  # turns on the spot
         ([0.0, 0.0, -0.11], True, [0.0, 0.0, -0.11]),
-        ([0.0, 0.0, 0.09], False, [0.0, 0.0, 0.0]),  # not worth a step
+        ([0.0, 0.0, 0.09], False, [0.0, 0.0, 0.0]),  # turns too slowly to need a step
         ([0.0, 0.0, 0.0], False, [0.0, 0.0, 0.0]),
         ([0.15, -0.13, 0.0], False, [0.0, 0.0, 0.0]),  # within the dead zone
         ([0.15, -0.13, 0.2], True, [0.0, 0.0, 0.2]),
@@ -172,7 +173,7 @@ def test_when_a_command_means_standing_still(velocity, moving, left, jit):
 
 
 def test_a_standing_robot_that_drifts_turns_back():
-    """0.5 * 0.3 rad is more than 0.1 rad/s."""
+    """A heading error of 0.3 rad commands 0.5 * 0.3 rad/s, which is more than 0.1 rad/s."""
     config = dataclasses.replace(PAPER, stand_still=True)
     command = make_command(heading=0.0, moving=False)
     assert not bool(commands.steer(config, command, jnp.asarray(0.19)).moving)
@@ -183,7 +184,7 @@ def test_a_standing_robot_that_drifts_turns_back():
 
 
 def test_fractions_and_ranges():
-    """30 % stand, 20 % of all go straight; the rest fill their ranges. 4000 draws: +-0.03."""
+    """30 % stand, 20 % of all go straight, the rest fill their ranges. 4000 draws allow +-0.03."""
     config = dataclasses.replace(
         PAPER, stand_fraction=0.3, forward_fraction=0.2, stand_still=True, dead_zone=0.0
     )

@@ -1,4 +1,4 @@
-"""The matrix of trainings: its jobs, that a stopped one goes on, its table, what is kept of it."""
+"""The comparison: its jobs, how it resumes a stopped one, its table, and the copies it keeps."""
 
 import dataclasses
 import json
@@ -34,17 +34,17 @@ def test_what_a_job_runs(tmp_path):
 
 
 def test_an_interrupted_training_is_resumed(tmp_path):
-    """With its preset: train refuses to go on with another one than the run began with."""
+    """A resume names the preset, because train refuses another one than the run began with."""
     args = compare.Args(out=tmp_path, variants=("kslc",))
     (tmp_path / "kslc-seed0" / "checkpoints").mkdir(parents=True)
     begun = next(compare.jobs(args)).train
-    assert "--resume" not in begun  # nothing there to go on from
+    assert "--resume" not in begun  # there is no checkpoint to resume from
     (tmp_path / "kslc-seed0" / "checkpoints" / "1" / "params").mkdir(parents=True)
     assert next(compare.jobs(args)).train == (*begun, "--resume")
 
 
 def finished_run(folder, survival=1.0):
-    """A run folder as a job leaves it, of 25 train steps, the range growing at the 14th."""
+    """A run folder as a job leaves it: 25 train steps, and the range grows at step 14."""
     folder.mkdir(parents=True)
     seed = int(folder.name[-1])
     laptop = dataclasses.replace(config.preset("laptop"), seed=seed)
@@ -66,12 +66,12 @@ def finished_run(folder, survival=1.0):
 
 
 ASKED = ("--steps", "2500000", "--speeds", "1.0", "--variants", "kslc")
-"""What `finished_run` is the answer to."""
+"""Arguments of the comparison that `finished_run` fulfils."""
 
 
 @pytest.fixture
 def called(monkeypatch):
-    """The commands that were run; all fail."""
+    """Records the commands that `compare` calls. All of them fail."""
     modules = []
 
     def fake(module, arguments):
@@ -102,7 +102,8 @@ def test_what_is_done_is_skipped_and_what_fails_is_named(tmp_path, called, capsy
     ],
 )
 def test_an_answer_to_another_question_does_not_count(tmp_path, called, other, again):
-    """What was trained does, and the old answer stays until there is another."""
+    """A training that is long enough counts; only its evaluation is repeated. The old evaluation
+    stays until a new one replaces it."""
     run = tmp_path / "kslc-seed0"
     finished_run(run)
     argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0"]
@@ -113,7 +114,7 @@ def test_an_answer_to_another_question_does_not_count(tmp_path, called, other, a
 
 @pytest.mark.parametrize("steps", ["2500000", "2500001"], ids=["finished", "to go on with"])
 def test_a_run_of_another_config_is_named_and_left_alone(tmp_path, called, capsys, steps):
-    """It would be taken for the one that is asked for, or its evaluation be lost."""
+    """Else its results would count as those of this config, or its evaluation would be lost."""
     folder = tmp_path / "kslc-seed0"
     finished_run(folder)
     other = config.preset("laptop", ("arms",))
@@ -129,7 +130,8 @@ def test_a_run_of_another_config_is_named_and_left_alone(tmp_path, called, capsy
 
 
 def test_a_run_that_trains_on_is_not_done_by_its_old_evaluation(tmp_path, called):
-    """Neither in the table nor at the next call, even if all that is left to do fails."""
+    """Its old evaluation counts neither in the table nor at the next call, even if the training
+    fails."""
     finished_run(tmp_path / "kslc-seed0")
     argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0"]
     assert compare.main([*argv, "--steps", "2500001"]) == 1
@@ -138,7 +140,7 @@ def test_a_run_that_trains_on_is_not_done_by_its_old_evaluation(tmp_path, called
 
 
 def test_the_children_are_as_quiet_as_each_command_alone(tmp_path, called, monkeypatch):
-    """They inherit what XLA is told to say, which JAX sets itself where nobody has."""
+    """They inherit XLA's log level from the environment. Without one, `compare` sets it."""
     monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
     compare.main(["--out", str(tmp_path), *ASKED, "--seeds", "0"])
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
@@ -208,7 +210,7 @@ def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
     ids=["to all", "to the parent"],
 )
 def test_a_signal_leaves_time_to_save(tmp_path, number, tell):
-    """The child takes longer than the 0.25 s that subprocess.run would give it."""
+    """The child saves for longer than the 0.25 s that `subprocess.run` would allow it."""
     child = """
 import signal, sys, time
 def save(*_):

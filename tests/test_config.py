@@ -1,4 +1,4 @@
-"""The paper's numbers, presets and ablations, storage, and errors that name the field."""
+"""The numbers of the paper, presets and ablations, storage, and errors that name the field."""
 
 import dataclasses
 import json
@@ -28,7 +28,7 @@ BASELINE = preset("baseline")
 
 
 def changes(a: Any, b: Any, where: str = "") -> dict[str, tuple[Any, Any]]:
-    """Every field that differs, by dotted name."""
+    """The fields that differ, by dotted name."""
     out = {}
     for f in dataclasses.fields(a):
         x, y = getattr(a, f.name), getattr(b, f.name)
@@ -68,7 +68,7 @@ def test_equations_2_to_8():
     assert (r.base_height_kernel, r.base_height_drop) == (100.0, 0.05)  # Eq. 6
     assert (r.joint_pos_kernel, r.joint_pos_penalty, r.joint_pos_clip) == (2.0, 0.2, 0.5)  # Eq. 8
     assert r.velocity_rewards and r.only_positive
-    # Ours, where Eq. 4 and 7 leave a number open.
+    # Our numbers, where Eq. 4 and 7 give none.
     assert (r.momentum_scale, r.momentum_floor) == (5.0, -20.0)
     assert (r.clearance_speed_gain, r.clearance_width) == (1.0, 0.01)
 
@@ -126,7 +126,7 @@ def test_our_additions_are_off_in_the_paper():
     assert not PAPER.rewards.clearance_mid_swing and not PAPER.ppo.entropy_fades
     assert (PAPER.gait.stride_sweep, PAPER.gait.double_support_at_speed) == (0.0, 0.1)
     assert PAPER.command.slow_fraction == PAPER.curriculum.settle_seconds == 0.0
-    assert PAPER.curriculum.gait_threshold == -1.0  # never below: feet_contact_number ends at -0.3
+    assert PAPER.curriculum.gait_threshold == -1.0  # below the least feet_contact_number, -0.3
     assert PAPER.network.init_mean == 1.0 and PAPER.randomize.noise == (1.0, 1.0)
 
 
@@ -137,7 +137,7 @@ def test_physics_departs_from_humanoid_gym_at_the_same_control_rate():
 
 
 def test_evaluation_physics():
-    """The other simulator: 1 kHz, converged solver, the same 100 Hz policy; C MuJoCo only."""
+    """Physics at 1 kHz with a converged solver; the policy still runs at 100 Hz. C MuJoCo only."""
     high = HighFidelity()
     assert (high.timestep, high.decimation, high.fidelity) == (0.001, 10, "high")
     assert (high.iterations, high.ls_iterations) == (100, 50)
@@ -191,7 +191,7 @@ LEARNER = {
 
 
 def test_laptop_departs_from_the_paper_in_these_numbers_only():
-    """docs/laptop_recipe.md gives the reason of each."""
+    """docs/laptop_recipe.md gives the reason for each number."""
     assert {k: v[1] for k, v in changes(PAPER, LAPTOP).items()} == LEARNER | {
         "network.estimator": (128, 64),
         "ppo.entropy_fades": True,
@@ -288,14 +288,15 @@ ARMS = ("gait.arm_swing", "gait.arm_swing_slow", "gait.elbow_bend")
     ],
 )
 def test_an_ablation_is_one_switch(base, name, expected):
-    """The reference of `paper` leaves the arms alone: there nothing but `env.arms` changes."""
+    """The reference pose of `paper` moves no arms, so that only `env.arms` changes there."""
     found = changes(preset(base), preset(base, (name,)))
     here = expected if base == "laptop" else {k: v for k, v in expected.items() if "gait" not in k}
     assert {k: v[1] for k, v in found.items()} == here
 
 
 def test_held_arms_are_not_asked_to_swing():
-    """The norm of Eq. 8 runs over the arms too: legs could earn nothing by their reference."""
+    """Eq. 8 takes the norm over the arms too. Held arms would keep it large, and the legs could
+    earn nothing with their reference."""
     held = dataclasses.replace(LAPTOP.env, arms="held")
     with pytest.raises(ConfigError, match="held arms cannot follow"):
         dataclasses.replace(LAPTOP, env=held)
@@ -310,7 +311,7 @@ def test_all_ablations_at_once():
 
 @pytest.mark.parametrize("name", list(PRESETS))
 def test_presets_are_static_arguments(name):
-    """Hashable, compared by value; the host's side of a run is no part of it."""
+    """Configs are hashable and compare by value. The fields of `run` do not count."""
     config = preset(name)
     same = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=7))
     assert hash(config) == hash(same) and config == same
@@ -494,7 +495,7 @@ def test_unknown_names(name, without, message):
     ],
 )
 def test_bad_values_are_refused(part, field, value):
-    """The message names the field, or for two that must agree, the part."""
+    """The message names the part and the field. For networks the part is enough."""
     with pytest.raises(ConfigError, match=f"{part}") as error:
         dataclasses.replace(getattr(PAPER, part), **{field: value})
     assert field in str(error.value) or part == "network"
@@ -508,8 +509,8 @@ def test_batch_must_split_into_minibatches():
 @pytest.mark.parametrize(
     ("field", "value", "less"),
     [
-        ("settle_seconds", 8.0, 7.9),  # of the 8 s until the next command
-        ("min_episode_steps", 2400.0, 2399.0),  # of 2400: a moving average never gets there
+        ("settle_seconds", 8.0, 7.9),  # a command lasts 8 s
+        ("min_episode_steps", 2400.0, 2399.0),  # a moving average never reaches the maximum, 2400
     ],
 )
 def test_a_gate_that_could_never_open_is_refused(field, value, less):
@@ -544,7 +545,7 @@ LATER_FIELDS = {
     "randomize.noise": (1.0, 1.0),
     "run.snapshots": 24,
 }
-"""Fields that the oldest files lack, with the values that give the numbers of then."""
+"""Fields that the oldest files lack, with the values that reproduce the old behaviour."""
 
 
 @pytest.mark.parametrize(("path", "then"), LATER_FIELDS.items())

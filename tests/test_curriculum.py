@@ -1,4 +1,4 @@
-"""Curriculum: averages by hand, each gate on its own, the paper's steps and limits."""
+"""Curriculum: averages by hand, each gate alone, the paper's steps and limits."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from kslc_jax.curriculum import Curriculum, Progress
 
 PAPER = preset("paper")
 CONFIG = PAPER.curriculum
-# Averages follow at once, so that one update shows the gate.
+# No smoothing: one update is enough to show the gate.
 DIRECT = dataclasses.replace(CONFIG, smoothing=0.0)
 
 
@@ -59,7 +59,7 @@ def test_another_trainings_progress_ends_at_the_limits_of_this_one():
     assert float(here.tracking) == pytest.approx(0.8)
     assert (
         float(curriculum.remaining_share(CONFIG, here)) == 0.0
-    )  # not below: it scales the entropy bonus
+    )  # never negative, because it scales the entropy bonus
     near = curriculum.inherit(PAPER, state(v_max=2.0, cycle_time=0.55))
     assert float(near.v_max) == 2.0 and float(near.cycle_time) == pytest.approx(0.55)
     fixed = preset("paper", ("velocity-curriculum", "cycle-curriculum"))
@@ -68,7 +68,7 @@ def test_another_trainings_progress_ends_at_the_limits_of_this_one():
 
 
 def test_averages_by_hand():
-    """0.95 of the old and 0.05 of the new: 0.05 * 0.8 = 0.04; 0.95 * 0.04 + 0.05 * 0.6 = 0.068."""
+    """0.95 old + 0.05 new: 0.05 * 0.8 = 0.04; 0.95 * 0.04 + 0.05 * 0.6 = 0.068."""
     one = curriculum.update(CONFIG, state(), progress(0.8, 0.4, 3, 200.0, 2))
     assert float(one.tracking) == pytest.approx(0.04)
     assert float(one.fast_tracking) == pytest.approx(0.02)
@@ -102,7 +102,7 @@ STRICT = dataclasses.replace(DIRECT, top_error=0.05, top_falls=1.0)
         ({"top_falls": 1.0}, True),
         ({"top_falls": 1.1}, False),
         ({"top_falls": 1.1, "top_minutes": 2.0}, True),
-        ({"top_scale": 0.0}, False),  # nobody was asked to run that fast yet
+        ({"top_scale": 0.0}, False),  # no robot had a command that fast yet
     ],
     ids=str,
 )
@@ -113,8 +113,9 @@ def test_a_range_whose_top_is_not_run_does_not_grow(seen, opens):
 
 
 def test_the_tops_sums_fade_by_hand():
-    """1 m/s too slow, then 4 too fast, of 20 each: (0.95 * -1 + 4) / (0.95 * 20 + 20) = 0.07821;
-    falls (0.95 * 2 + 0) / (0.95 * 1 + 1) = 0.97436 a minute. A wider range starts anew."""
+    """1 m/s too slow, then 4 m/s too fast, in sums of 20 m/s each: (0.95 * -1 + 4) / (0.95 * 20 +
+    20) = 0.07821. Falls per minute: (0.95 * 2 + 0) / (0.95 * 1 + 1) = 0.97436. A wider range starts
+    with empty sums."""
     one = curriculum.update(CONFIG, state(), progress(top_deviation=-1, top_scale=20, top_falls=2))
     two = curriculum.update(CONFIG, one, progress(top_deviation=4, top_scale=20))
     assert float(curriculum.top_error(two)) == pytest.approx(0.07821, abs=1e-5)
@@ -131,7 +132,8 @@ def test_the_top_is_the_last_step_of_the_range(vx, top):
 
 
 def test_averages_skip_what_was_not_seen():
-    """No fast command and no finished episode leave their averages as they are."""
+    """An average without new samples stays: without fast commands, finished episodes, or settled
+    commands."""
     old = state(tracking=0.5, fast_tracking=0.6, episode_steps=700.0)
     new = curriculum.update(CONFIG, old, progress(0.7, 0.0, 0, 0.0, 0))
     assert float(new.tracking) == pytest.approx(0.51)
@@ -171,14 +173,14 @@ def test_each_gate_alone_keeps_everything(closed, open_):
 
 @pytest.mark.parametrize(("updates", "v_max"), [(38, 0.5), (39, 1.0), (0, 0.5)])
 def test_some_updates_between_two_changes(updates, v_max):
-    """The 40th update after a change may make the next."""
+    """The 40th update after a change may be the next change."""
     new = curriculum.update(DIRECT, state(updates=updates), progress())
     assert float(new.v_max) == v_max
     assert int(new.updates) == (0 if v_max == 1.0 else updates + 1)
 
 
 def test_the_whole_way_of_the_paper():
-    """+0.5 m/s up to 3.5; x 0.95 down to 0.48: 0.64 * 0.95^6 would be 0.47046."""
+    """Speed: +0.5 m/s up to 3.5. Cycle: x 0.95 down to 0.48 s; 0.64 * 0.95^6 would be 0.47046."""
     current, speeds, cycles, changes = state(), [], [], 0
     update = jax.jit(curriculum.update, static_argnums=0)
     for _ in range(400):
@@ -195,7 +197,7 @@ def test_the_whole_way_of_the_paper():
         cycles, [0.608, 0.5776, 0.54872, 0.521284, 0.4952198, 0.48], rtol=1e-5
     )
     assert changes == 6
-    assert int(current.updates) == 400 - 6 * 40  # the end is not counted as a change
+    assert int(current.updates) == 400 - 6 * 40  # at the limits, an open gate is no change
     assert float(current.fast_tracking) == pytest.approx(0.75)
 
 
@@ -222,9 +224,8 @@ def test_fast_commands_are_above_60_percent_of_the_range(vx, fast):
 
 
 def test_start_average_cannot_open_the_gate_early():
-    """From 0, tracking 0.85 passes 0.8 when 0.95^n < 1 - 0.8 / 0.85: after 56 updates.
-
-    The fast average and the episodes are above their gates by then.
+    """The average starts at 0. With tracking 0.85 it passes 0.8 when 0.95^n < 1 - 0.8 / 0.85: after
+    56 updates. The fast average and the episode length have passed their gates by then.
     """
     current, n = state(), 0
     update = jax.jit(curriculum.update, static_argnums=0)
@@ -235,7 +236,7 @@ def test_start_average_cannot_open_the_gate_early():
 
 @pytest.mark.parametrize(("v_max", "left"), [(0.5, 1.0), (2.0, 0.5), (3.5, 0.0)])
 def test_what_is_left_of_the_way(v_max, left):
-    """From 0.5 to 3.5 m/s."""
+    """The share of the range from 0.5 to 3.5 m/s that is still ahead."""
     assert float(curriculum.remaining_share(CONFIG, state(v_max=v_max))) == pytest.approx(left)
 
 

@@ -1,7 +1,7 @@
-"""One training over several devices and processes: the numbers of one device.
+"""A training on several devices or processes gives the numbers of one device.
 
-XLA reads how many devices to make of a CPU when it starts, so most of this runs in child processes:
-this file, run as a script, calls the function that is named on its command line.
+XLA reads the number of CPU devices only when it starts. Most of these tests therefore run in child
+processes. A child runs this file as a script, and calls the function that its command line names.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ MJX = dataclasses.replace(preset("debug"), physics=physics.PhysicsConfig(engine=
 
 
 def glide(config, state, target, dynamics, ground_friction):
-    """Physics that compiles at once: the joints go to their targets, nothing else moves."""
+    """Physics that compiles fast: the joints move towards their targets, and nothing else moves."""
     qpos = state.qpos.at[7:].set(0.9 * state.qpos[7:] + 0.1 * target)
     return state.replace(qpos=qpos, torque=target)
 
@@ -45,7 +45,7 @@ def numbers(tree) -> dict[str, np.ndarray]:
 
 
 def learn(folder, engine):
-    """Trains on 1 and on 4 devices, and takes each other's last but one checkpoint to its end."""
+    """Trains on 1 and on 4 devices. Then each does the last step from the other's checkpoint."""
     folder = Path(folder)
     if engine == "glide":
         env.step = functools.partial(env.step, simulate=glide)
@@ -71,7 +71,7 @@ def learn(folder, engine):
 
 
 def learn_together(out, port, index, processes="2"):
-    """Trains with the devices of all processes."""
+    """Trains on the devices of all processes."""
     devices.join(f"127.0.0.1:{port}", int(processes), int(index))
     assert jax.device_count() == int(processes) * jax.local_device_count()
     init, step = devices.make(MJX, devices.mesh(MJX))
@@ -102,7 +102,7 @@ GLIDE = (__file__, "command_line")
 
 
 def assert_same_training(a, b, tolerance=1e-3):
-    """Two run folders, in all but what the clock says."""
+    """Both run folders have the same metrics, apart from the wall clock."""
     assert len(rows(a)) == len(rows(b))
     for one, other in zip(rows(a), rows(b), strict=True):
         for name in set(one) - {"seconds", "steps_per_second"}:
@@ -110,7 +110,7 @@ def assert_same_training(a, b, tolerance=1e-3):
 
 
 def latest(run_dir):
-    """The numbers of the latest checkpoint."""
+    """(train step, numbers) of the latest checkpoint."""
     with contextlib.closing(checkpoint.Store(run_dir)) as store:
         return store.steps()[-1], numbers(store.restore(like(), print))
 
@@ -127,18 +127,19 @@ SLOW = pytest.mark.slow(reason="compiles the train step three times for four dev
 
 @pytest.fixture(scope="module")
 def glided(tmp_path_factory):
-    """What `learn` left, with cheap physics."""
+    """The folder that `learn` wrote with the physics of `glide`."""
     return learnt(tmp_path_factory.mktemp("glide"), "glide")
 
 
 @pytest.fixture(scope="module")
 def stepped(tmp_path_factory):
-    """What `learn` left, with MJX."""
+    """The folder that `learn` wrote with MJX."""
     return learnt(tmp_path_factory.mktemp("mjx"), "mjx")
 
 
 def assert_close(a: Path, b: Path, tolerance=1e-3):
-    """Sums of other orders: a mean over 128 joint accelerations is off by 2e-4 on some machines."""
+    """The devices add in another order: a mean over 128 joint accelerations differs by up to 2e-4
+    on some machines."""
     with np.load(a) as one, np.load(b) as other:
         assert set(one) == set(other) and len(one) > 50
         for name in one:
@@ -160,7 +161,7 @@ def test_checkpoints_move_between_device_counts(before, after, glided):
 
 @SLOW
 def test_one_device_reads_the_checkpoint_of_four(glided):
-    """In a process that never had four."""
+    """This process never had four devices."""
     with contextlib.closing(checkpoint.Store(glided / "4")) as store:
         state = store.restore(like(), print)
     with np.load(glided / "4-saved.npz") as saved:
@@ -170,8 +171,8 @@ def test_one_device_reads_the_checkpoint_of_four(glided):
 
 @SLOW
 def test_devices_tell_what_the_documentation_counts(glided):
-    """Per train step, by the text of the program: each frame is sent once, and gradients are summed
-    at one place, in the loop over minibatches."""
+    """Communication per train step, from the text of the compiled program: each frame is sent once,
+    and gradients are summed at one place, in the loop over minibatches."""
     assert not collectives(glided / "1.txt")
     told = collectives(glided / "4.txt")
     n, t = MJX.env.num_envs, MJX.ppo.rollout_steps
@@ -184,7 +185,7 @@ def test_devices_tell_what_the_documentation_counts(glided):
     assert set(told) == {"all-gather", "all-reduce"}
     assert sum(told["all-gather"]) == sum(floats.values())
     params = sum(x.size for x in jax.tree.leaves(like().learner.params))
-    # A few numbers are summed in parts, and some scalars with them.
+    # A few numbers are summed separately, and some scalars are summed with the gradients.
     assert [abs(size - params) < 50 for size in told["all-reduce"]].count(True) == 1
     assert sum(told["all-reduce"]) < params + 100
 
@@ -195,7 +196,7 @@ def like():
 
 
 def collectives(program: Path) -> dict[str, list[int]]:
-    """How many numbers each collective of a compiled program gives, by kind."""
+    """Number of elements that each collective of a compiled program returns, by kind."""
     found: dict[str, list[int]] = {}
     kinds = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
     for shapes, kind in re.findall(rf" = (.*) ({kinds})\(", program.read_text()):
@@ -214,7 +215,7 @@ def test_four_devices_learn_what_one_learns_with_mjx(stepped):
 
 @pytest.mark.slow(reason="compiles MJX four times, three minutes on two cores")
 def test_two_processes_learn_what_one_learns(stepped, tmp_path):
-    """Two processes on this machine, of two devices each."""
+    """Two processes on this machine, with two devices each."""
     port = free_port()
     files = [tmp_path / f"{index}.npz" for index in range(2)]
     with contextlib.ExitStack() as both:
@@ -243,7 +244,7 @@ def one(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """Three steps of it by two processes of two devices each."""
+    """Three steps of the same training by two processes with two devices each."""
     run_dir = tmp_path_factory.mktemp("two") / "r"
     with contextlib.ExitStack() as stack:
         ended(started(stack, *GLIDE, *DEBUG, "--steps", 3 * MJX.batch_size, "--run-dir", run_dir))
@@ -252,7 +253,7 @@ def two(tmp_path_factory):
 
 @TWO
 def test_two_processes_start_what_one_device_goes_on_with(one, two, tmp_path):
-    """And four devices of one process after that."""
+    """After one device, four devices of one process resume it."""
     run_dir = tmp_path / "r"
     shutil.copytree(two, run_dir)
     more = (*GLIDE, "--resume", "--run-dir", run_dir, "--steps")
@@ -278,7 +279,7 @@ def test_two_processes_train_by_the_command_line_itself(stepped, tmp_path):
 
 @pytest.mark.slow(reason="compiles a second train step")
 def test_one_device_is_a_mesh_too(debug):
-    """A mesh of one device changes no bit, and takes the mujoco engine."""
+    """A mesh of one device gives the same bits, also with the mujoco engine."""
     finals = []
     for init, step in (train_step.make(debug), devices.make(debug, devices.mesh(debug))):
         state, metrics = run(step, init(), 2)
@@ -297,7 +298,7 @@ def test_what_cannot_be_split_is_refused(debug):
 
 @pytest.mark.slow(reason="compiles a train step of two seeds")
 def test_seeds_train_side_by_side(debug):
-    """vmap over seeds gives each seed the training it has alone."""
+    """vmap over seeds gives each seed the same training as alone."""
     seeds = jnp.array([0, 1])
     init = jax.jit(functools.partial(train_step.init, debug))
     step = jax.jit(jax.vmap(functools.partial(train_step.step, debug)))

@@ -1,4 +1,4 @@
-"""The documents: links lead somewhere, names exist, every page is listed."""
+"""The documents: links have a target, names exist, the index lists every page."""
 
 import json
 import re
@@ -15,7 +15,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 def prose(path: Path) -> str:
-    """A page's or a notebook's text without its fenced code."""
+    """The text of a page or of a notebook, without fenced code."""
     text = path.read_text()
     if path.suffix == ".ipynb":
         cells = json.loads(text)["cells"]
@@ -24,14 +24,14 @@ def prose(path: Path) -> str:
 
 
 def anchors(path: Path) -> set[str]:
-    """The names that GitHub gives to a page's headings."""
+    """The anchors that GitHub makes from the headings of a page."""
     headings = re.findall(r"^#+ (.*)$", prose(path), re.M)
     kept = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
     return {heading.replace(" ", "-") for heading in kept}
 
 
 def broken_links(path: Path) -> list[str]:
-    """The relative links of a page that lead nowhere."""
+    """The relative links of a page that have no target."""
     links = re.findall(r"\]\(([^)\s]+)\)", prose(path))
     broken = []
     for link in (link for link in links if not re.match(r"[a-z]+:", link)):

@@ -1,4 +1,4 @@
-"""Drake against C MuJoCo: the same robot, the same motion, the same rest; contact of its own."""
+"""Drake against C MuJoCo: the same robot, motion in the air, standing height, and sliding."""
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,7 @@ def rest(qpos, qvel=None):
 
 
 def simulate(world, state, target=0.0, steps=1):
-    """States of `steps` control steps in Drake and in C MuJoCo."""
+    """The states after each of `steps` control steps, in Drake and in C MuJoCo."""
     target = np.full(16, target)
     ours, theirs = [state], [state]
     for _ in range(steps):
@@ -56,7 +56,8 @@ def test_total_mass(world):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_links_and_mass_matrix_agree_at_random_poses(world, seed):
-    """Positions to 1e-9 m, the 22 x 22 mass matrix in MuJoCo's coordinates to 1e-9 relative."""
+    """Positions agree to 1e-9 m. The 22 x 22 mass matrix, in MuJoCo's coordinates, agrees to 1e-9
+    of its largest element."""
     model, data = world.data.model, mujoco.MjData(world.data.model)
     data.qpos[:], data.qvel[:] = random_state(seed)
     mujoco.mj_forward(model, data)
@@ -69,7 +70,7 @@ def test_links_and_mass_matrix_agree_at_random_poses(world, seed):
         np.testing.assert_allclose(position, data.xpos[i], atol=1e-9)
     theirs = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, theirs)
-    # Drake's velocities are turned @ qvel: the base's rate is in the world there.
+    # Drake's velocities are turned @ qvel: it has the base's angular velocity in the world frame.
     turned = np.eye(model.nv)
     mujoco.mju_quat2Mat(flat := np.zeros(9), data.qpos[3:7])
     turned[3:6, 3:6] = flat.reshape(3, 3)
@@ -78,18 +79,19 @@ def test_links_and_mass_matrix_agree_at_random_poses(world, seed):
 
 
 def test_free_fall_is_exact(world):
-    """From rest both engines' semi-implicit Euler gives z = z0 - g dt^2 n (n + 1) / 2."""
+    """From rest, semi-implicit Euler gives z = z0 - g dt^2 n (n + 1) / 2 in both engines."""
     qpos = world.robot.default_qpos.copy()
     qpos[2] = 5.0
     n, dt = 200, CONFIG.timestep
     expected = 5.0 - 9.81 * dt**2 * n * (n + 1) / 2
     for states in simulate(world, rest(qpos), steps=n // CONFIG.decimation):
-        assert states[-1].qpos[2] == pytest.approx(expected, abs=1e-5)  # float32 in C MuJoCo's
+        assert states[-1].qpos[2] == pytest.approx(expected, abs=1e-5)  # C MuJoCo's is float32
         np.testing.assert_allclose(states[-1].qpos[7:], 0.0, atol=1e-5)
 
 
 def test_tumbling_with_driven_joints_agrees(world):
-    """0.2 s in the air, rotating, all joints driven to 0.3 rad: inertia, motors, friction."""
+    """0.2 s of rotation in the air, with all joints driven to 0.3 rad. Tests inertia, motors and
+    joint friction."""
     qpos = world.robot.default_qpos.copy()
     qpos[2] = 5.0
     qvel = np.r_[1.0, 0.5, 2.0, 1.0, -2.0, 1.5, np.zeros(16)]
@@ -99,7 +101,8 @@ def test_tumbling_with_driven_joints_agrees(world):
 
 
 def test_dropped_on_its_feet_it_rests_at_the_same_height(world):
-    """From 2 cm, servos holding: within 5 mm from 0.2 s on, and the feet carry the weight."""
+    """A drop from 2 cm with active servos. From 0.2 s on, the heights agree within 5 mm; then the
+    feet carry the weight."""
     qpos = world.robot.default_qpos.copy()
     qpos[2] = 0.905
     ours, theirs = simulate(world, rest(qpos), steps=60)
@@ -111,8 +114,8 @@ def test_dropped_on_its_feet_it_rests_at_the_same_height(world):
 
 
 def test_low_friction_slides(world):
-    """Set down at 0.3 m/s sideways the feet slide 2 cm in 0.2 s with friction 0.05 in both engines,
-    and hardly with 1.0."""
+    """The robot lands at 0.3 m/s sideways. With friction 0.05 its feet slide about 2 cm in 0.2 s in
+    both engines; with 1.0 they slide less than 5 mm."""
     qpos = world.robot.default_qpos.copy()
     qpos[2] = 0.885
     state = rest(qpos, np.r_[0.0, 0.3, np.zeros(20)])
@@ -133,7 +136,8 @@ def test_low_friction_slides(world):
 
 
 def test_step_is_physics_step(world):
-    """Under jit and vmap, with different payloads: shapes, types, and each as it is alone."""
+    """Under jit and vmap, with different payloads: shapes are right, and each environment gives the
+    same numbers as alone."""
     step = jax.jit(
         jax.vmap(lambda s, d: drake.step(CONFIG, s, jnp.zeros(16), d, 1.0), in_axes=(None, 0))
     )
@@ -154,7 +158,7 @@ def test_a_diverged_step_shows_as_nan(world):
 
 
 def test_servos_alone_stand_a_second_in_drake():
-    """The whole way of a policy: environment, signals, observations, trace."""
+    """A policy runs in a trial: environment, signals, observations, trace."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
     still = policy_lib.Policy(config, params, curriculum.init(config), 0)

@@ -1,4 +1,4 @@
-"""One environment: what a reset leaves behind, how episodes end, what the actor sees."""
+"""One environment: resets, the ends of episodes, actions, pushes, commands and observations."""
 
 import dataclasses
 
@@ -27,7 +27,8 @@ def setting():
 
 
 def test_reset_is_all_that_a_new_episode_is_made_of(setting):
-    """A step that ends an episode returns exactly reset(its key): no field of the old one."""
+    """A step that ends an episode returns reset(key) of its own key. No field of the old episode is
+    left."""
     _config, reset, step = setting
     state = reset(jax.random.key(0))
     for i in range(5):
@@ -70,7 +71,7 @@ def test_broken_physics_is_masked_and_reset(setting):
 
 
 def test_action_becomes_the_joint_target(setting):
-    """Without delay and noise the servo pulls towards 0.25 rad x action."""
+    """Without delay and noise, the joint moves to 0.25 rad x action."""
     _, reset, step = setting
     state = reset(jax.random.key(0))
     action = jnp.zeros(16).at[12].set(2.0)
@@ -81,7 +82,8 @@ def test_action_becomes_the_joint_target(setting):
 
 
 def test_delay_and_noise(debug):
-    """(1 - d) a + d a_prev with d <= 0.5, times 1 + 0.02 n; clipped at 18 before."""
+    """The applied action is ((1 - d) a + d a_prev) (1 + 0.02 n) with d <= 0.5; a is clipped at 18
+    before."""
     keys = jax.random.split(jax.random.key(0), 4000)
 
     def apply(noise):
@@ -91,7 +93,7 @@ def test_delay_and_noise(debug):
     np.testing.assert_array_equal(apply(0.0), 18.0)
     applied = apply(1.0)
     assert 18.0 < float(applied.max()) < 18.0 * 1.1  # noise comes after the clip
-    per_env = applied.mean(axis=1)  # noise averages out over joints, the delay is per environment
+    per_env = applied.mean(axis=1)  # noise averages out over joints; the delay is per environment
     assert per_env.min() == pytest.approx(9.0, abs=0.4)
     assert per_env.max() == pytest.approx(18.0, abs=0.4)
     assert float(jnp.mean(jnp.std(applied, axis=1) / per_env)) == pytest.approx(0.02, abs=0.002)
@@ -105,7 +107,8 @@ def test_held_arms_ignore_actions():
 
 @pytest.mark.parametrize("adds", [True, False])
 def test_pushes(debug, adds):
-    """Every 4 s, within U(-0.2, 0.2) m/s and U(-0.4, 0.4) rad/s; added, or set as HG does."""
+    """Pushes come every 4 s, from U(-0.2, 0.2) m/s and U(-0.4, 0.4) rad/s. They are added to the
+    velocity, or replace it as in Humanoid-Gym."""
     config = dataclasses.replace(
         debug, randomize=dataclasses.replace(debug.randomize, push_adds=adds)
     )
@@ -124,7 +127,7 @@ def test_pushes(debug, adds):
 
 
 def test_commands_are_resampled_every_8_seconds(setting):
-    """The step is still judged by the command that the policy saw."""
+    """The reward of the step uses the command that the policy saw, not the new one."""
     config, reset, step = setting
     robot = physics.robot_for(config.physics)
     state = reset(jax.random.key(3))
@@ -138,7 +141,7 @@ def test_commands_are_resampled_every_8_seconds(setting):
 
 
 def test_tracking_settles_two_seconds_after_a_new_command(setting):
-    """Laptop setting: 200 steps after the reset and after each resampling at 800."""
+    """With the laptop's settle time: 200 steps after the reset and after the new command at 800."""
     _, reset, step = setting
     state = reset(jax.random.key(3))
     for time, settled in ((0, False), (199, False), (200, True), (799, True), (800, False)):
@@ -147,7 +150,7 @@ def test_tracking_settles_two_seconds_after_a_new_command(setting):
 
 
 def test_jit_equals_no_jit_and_batch_of_one():
-    """float32 fusions reorder sums: 1e-5."""
+    """The tolerance is 1e-4, because fused float32 programs add in another order."""
     config = preset("debug")
     cur = curriculum.init(config)
     state = env.reset(config, jax.random.key(0), cur)
@@ -164,7 +167,7 @@ def test_jit_equals_no_jit_and_batch_of_one():
 
 @pytest.mark.slow(reason="compiles MJX; test_physics.py compares the engines in the quick suite")
 def test_engines_give_the_same_environment():
-    """The same 10 steps through mjx and mujoco: frames agree to 1e-3."""
+    """After the same 10 steps in mjx and mujoco, the frames agree to 1e-3."""
     frames = []
     for engine in ("mjx", "mujoco"):
         base = preset("debug")
@@ -180,7 +183,8 @@ def test_engines_give_the_same_environment():
 
 
 def test_torso_contact_ends_the_episode(xbot):
-    """The 0.4 m box centred 0.1 m above the base origin: upright it touches below 0.1 m."""
+    """The torso box is 0.4 m wide, and its centre is 0.1 m above the base origin. Upright, it
+    touches the ground if the base is below 0.1 m."""
     config = preset("debug").physics
     from kslc_jax import signals
 
@@ -195,7 +199,7 @@ def test_torso_contact_ends_the_episode(xbot):
 
 
 def test_frames_hold_what_the_state_holds(setting):
-    """Actor and critic frames of a reset state, component by component."""
+    """Some components of the actor and critic frames after a reset equal the state."""
     _config, reset, _ = setting
     state = reset(jax.random.key(5))
     actor = {n: state.history[-1][s] for n, s in observations.slices(observations.ACTOR).items()}
@@ -211,7 +215,7 @@ def test_frames_hold_what_the_state_holds(setting):
 
 
 def test_the_engine_steps_the_robot_of_the_episode(setting):
-    """Its dynamics, not the nominal ones, and the ground's friction."""
+    """The engine gets the episode's dynamics, not the nominal ones, and the ground friction."""
     config, reset, _ = setting
     state, given = reset(jax.random.key(0)), []
 
@@ -235,7 +239,7 @@ def test_commands_come_from_the_curriculums_range(setting):
 
 
 def test_rewards_compare_with_the_steps_before(setting):
-    """Velocities of the step before, actions of the two before."""
+    """The terms use the velocities of the step before and the actions of the two steps before."""
     config, reset, step = setting
     robot = physics.robot_for(config.physics)
     a = np.asarray(0.3 * jax.random.normal(jax.random.key(2), (3, 16)))
@@ -257,7 +261,8 @@ def test_rewards_compare_with_the_steps_before(setting):
 
 
 def test_a_step_pushes_and_the_critic_sees_it(debug):
-    """Both ways, up to 0.2 m/s and 0.4 rad/s; frames are of after the push."""
+    """Pushes have both signs, up to 0.2 m/s and 0.4 rad/s. The frames show the state after the
+    push."""
     cur = curriculum.init(debug)
     state = env.reset(debug, jax.random.key(0), cur).replace(time=jnp.asarray(399))
     step = jax.jit(jax.vmap(lambda key: env.step(debug, state, jnp.zeros(16), key, cur)[0]))

@@ -1,4 +1,4 @@
-"""Exported files against JAX, and the runner that uses nothing else against the package."""
+"""Exported files against JAX, and the stand-alone runner of exported files against the package."""
 
 import dataclasses
 import functools
@@ -34,15 +34,15 @@ RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
 ROBOTS = 8
 STEPPED = PhysicsConfig(engine="mujoco", timestep=0.001, decimation=10)
-"""The runner's physics: joint by joint on the host, at high fidelity's 1 ms."""
+"""Physics of the runner: C MuJoCo with steps of 1 ms, as at high fidelity."""
 
 
 @functools.cache
 def make_policy(kind):
-    """Random parameters that stand for a second; the curriculum has moved on from its start.
+    """A policy with random parameters that stands for a second. Its curriculum is past the start.
 
-    symmetric: a mirrored network, the laptop preset's clock and commands. plain: a free network,
-    the paper's clock and commands, arms held.
+    symmetric: a mirror-symmetric network, with the clock and commands of the laptop preset. plain:
+    an ordinary network, with the clock and commands of the paper, and held arms.
     """
     config, paper = preset("debug"), preset("paper")
     if kind == "plain":
@@ -50,7 +50,7 @@ def make_policy(kind):
             config,
             env=dataclasses.replace(config.env, arms="held"),
             network=dataclasses.replace(config.network, symmetric=False, estimator=()),
-            gait=paper.gait,  # without a reference for the arms
+            gait=paper.gait,  # its reference pose moves no arms
             command=paper.command,
         )
     config = dataclasses.replace(config, physics=PhysicsConfig(engine="mujoco"))
@@ -134,7 +134,7 @@ def test_the_graph_estimates_the_velocity_and_then_acts(onnx_file):
 
 
 def test_metadata(symmetric, xbot):
-    """By literal numbers where the paper or Humanoid-Gym gives them."""
+    """The numbers are typed by hand where the paper or Humanoid-Gym gives them."""
     data = export.metadata(symmetric)
     assert data["metadata_version"] == 3 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
@@ -226,7 +226,7 @@ def test_command_line(saved, tmp_path, capsys, monkeypatch):
     assert onnx.load(out).producer_name == "kslc_jax"
     assert seen[0].shape == (1000, 3, 59)
     newest = seen[0][:, -1]
-    assert len(np.unique(newest, axis=0)) > 900  # a policy at work, under several commands
+    assert len(np.unique(newest, axis=0)) > 900  # a policy that acts, under several commands
     assert len(np.unique(newest[:, 2])) > 3
 
 
@@ -268,7 +268,7 @@ def test_onnx_missing_is_one_line(saved, tmp_path, monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def trajectory(policy):
-    """Environments from the default pose under their own commands, 101 states."""
+    """101 states of `ROBOTS` environments from the default pose, each with its own command."""
     config = trials.trial_config(policy.config, trials.Setting(STEPPED), ROBOTS)
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, reset_joint_noise=0.0))
 
@@ -287,7 +287,7 @@ def trajectory(policy):
 
 
 def controller_of(runner, path, states, i):
-    """A runner that starts where environment `i` starts."""
+    """A controller of the runner with command and phase of the start of environment `i`."""
     command = states.command
     vx, vy, _ = command.velocity[0, i].tolist()
     controller = runner.Controller(path, vx, vy, command.heading[0, i])
@@ -296,9 +296,9 @@ def controller_of(runner, path, states, i):
 
 
 def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajectory):
-    """It builds observations a second time: all frames of a second."""
+    """The runner has its own code for observations. All frames of one second are compared."""
     qpos, qvel = trajectory.physics.qpos, trajectory.physics.qvel
-    assert (trajectory.time == np.arange(len(qpos))[:, None]).all()  # nobody has fallen
+    assert (trajectory.time == np.arange(len(qpos))[:, None]).all()  # no robot has fallen
     assert trajectory.command.moving.all() != policy.config.command.stand_still
     for i in range(ROBOTS):
         controller = controller_of(runner, onnx_file, trajectory, i)
@@ -308,7 +308,7 @@ def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajecto
 
 
 def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
-    """Servo solve, torques, decimation and actions: 0.8 s of the robot, by itself."""
+    """The runner simulates 0.8 s alone: actions, torques, servos, physics steps."""
     steps = 80
     model = mujoco.MjModel.from_xml_path(str(robot.MODEL_PATH))
     model.opt.timestep = STEPPED.timestep
@@ -333,7 +333,7 @@ def test_motor_torque_is_the_packages(runner, symmetric, xbot):
 
 
 def test_the_runner_alone(onnx_file, tmp_path):
-    """In a process of its own, far from the repository, without JAX and kslc_jax."""
+    """In a separate process, outside the repository, without JAX and kslc_jax."""
     check = (
         "import runpy, sys; sys.argv = sys.argv[1:];"
         "runpy.run_path(sys.argv[0], run_name='__main__');"

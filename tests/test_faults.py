@@ -1,4 +1,4 @@
-"""What a training survives: bad numbers, a full disk, damaged files, a second one in its folder."""
+"""Faults in a training: bad numbers, full disks, damaged files, a second process in its folder."""
 
 import ast
 import contextlib
@@ -44,7 +44,7 @@ DEBUG = preset("debug")
 
 @pytest.fixture(scope="module")
 def made():
-    """Debug preset: initial state maker and compiled train step."""
+    """Debug preset: (init, compiled step)."""
     init, step = train_step.make(DEBUG)
     return init, step.lower(init()).compile()
 
@@ -54,7 +54,7 @@ def made():
     params=["mujoco", pytest.param("mjx", marks=pytest.mark.slow(reason="compiles MJX"))],
 )
 def either(request, made):
-    """The same with each engine."""
+    """`made` with each engine."""
     if request.param == "mujoco":
         return made
     physics_config = dataclasses.replace(DEBUG.physics, engine=request.param)
@@ -70,7 +70,7 @@ def like():
 
 @pytest.fixture(scope="module")
 def state_at(like):
-    """A state at a train step, full of numbers that mean nothing: what files are filled with."""
+    """Gives a state at a train step, full of random numbers, to fill checkpoints."""
 
     def leaf(x):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -90,14 +90,14 @@ def same(a, b):
 
 
 def the_error(capsys):
-    """The one line that says what is wrong. Threads of orbax whose disk was full, tests ago, may
-    still be writing tracebacks."""
+    """The one line with the error. Other lines are ignored: threads of orbax from an earlier test
+    with a full disk may still write tracebacks."""
     (line,) = [x for x in capsys.readouterr().err.splitlines() if x.startswith("error: ")]
     return line
 
 
 def put(tree, where, value, rows=slice(None)):
-    """`tree` with `value` in the rows of the field named by a dotted path."""
+    """A copy of `tree` with `value` in some rows of a field. `where` is the dotted path of it."""
     name, _, rest = where.partition(".")
     old = tree[name] if isinstance(tree, dict) else getattr(tree, name)
     new = put(old, rest, value, rows) if rest else old.at[rows].set(value)
@@ -115,7 +115,8 @@ SEEN_LATER = {"last_last_action": 2, "physics.qvel": 1}  # samples lost to an ov
 
 
 class TestEnvironments:
-    """One sample is lost, nothing else: not the update, not the curriculum, not the neighbours."""
+    """A bad environment loses its samples only. Update, curriculum and other environments stay
+    good."""
 
     def assert_contained(self, either, where, value, rows, lost):
         init, step = either
@@ -140,12 +141,13 @@ class TestEnvironments:
 
     @pytest.mark.parametrize(("where", "lost"), SEEN_LATER.items())
     def test_overflow_in_mid_rollout(self, either, where, lost):
-        """Finite at the start, so that the step itself makes the bad number."""
+        """The state is finite at the start, so that the step itself makes the bad number."""
         self.assert_contained(either, where, 1e30, slice(3, 4), lost)
 
 
 class TestLearner:
-    """What masking cannot mend is counted, and said in `finite`."""
+    """Masking cannot repair a bad learner or curriculum: the metrics `finite` and `ppo/skipped`
+    show it."""
 
     @pytest.mark.parametrize(
         "where",
@@ -173,7 +175,8 @@ class TestLearner:
         assert metrics["finite"] == 0
 
     def test_gradient(self, either):
-        """A critic so large that its loss overflows: every update is skipped, nothing changes."""
+        """The critic is so large that its loss overflows. Every update is skipped, and the learner
+        does not change."""
         init, step = either
         state = put(init(), "learner.params.critic.Dense_0.kernel", 1e30, ...)
         before = jax.tree.map(jnp.copy, state.learner)
@@ -187,10 +190,10 @@ class TestLearner:
 
 @pytest.fixture
 def training(state_at, tmp_path, monkeypatch):
-    """Runs the command line with a train step that only counts, and with `poison(state)` before it.
+    """Runs the command line with a train step that only counts. `poison(state)` runs before it.
 
-    Poisoned are, as the metrics then say: a parameter with NaN, or the gradient by an infinite
-    learning rate."""
+    The metrics report a NaN parameter as not finite, and an infinite learning rate as a skipped
+    update."""
 
     def run(poison, *args):
         class Step:
@@ -277,7 +280,7 @@ class TestGoingBack:
         assert new.key != state.key and same(new.learner.params, state.learner.params)
 
     def test_caution_lasts(self, made):
-        """The KL rule raises the lowered learning rate by 2 % a train step at most."""
+        """The KL rule raises a lowered learning rate by at most 2 % a train step."""
         init, step = made
         state = recovery.with_lower_rate(init(), 1)
         low = float(state.learner.learning_rate)
@@ -310,7 +313,7 @@ class TestGoingBack:
 
 @pytest.fixture
 def disk(tmp_path):
-    """A folder on a disk of 1 MB of its own."""
+    """A folder on its own disk of 1 MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
     done = subprocess.run(
@@ -324,7 +327,7 @@ def disk(tmp_path):
 
 @contextlib.contextmanager
 def longest_file(size):
-    """No file may grow beyond `size` bytes: what a full disk is to one who may not mount."""
+    """No file may grow beyond `size` bytes. It imitates a full disk without the right to mount."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
@@ -348,7 +351,7 @@ def saved(state_at):
 
 @pytest.fixture
 def restored(like):
-    """(train step, warnings) of what a resume of a run folder would go on from."""
+    """Gives (train step, warnings) of the checkpoint from which a run folder would resume."""
 
     def restore(run_dir):
         said = []
@@ -373,7 +376,7 @@ class TestFullDisk:
         assert restored(disk) == (3, [])
 
     def test_too_long_a_file(self, saved, restored, state_at, tmp_path):
-        """The same without rights to mount: nothing of the failure is left for the next save."""
+        """The same without the right to mount. The failure does not disturb the next save."""
         saved(tmp_path, 1)
         with contextlib.closing(Store(tmp_path)) as store:
             with longest_file(2000), pytest.raises(CheckpointError, match="could not save"):
@@ -435,8 +438,11 @@ class TestFullDisk:
 
 
 def flip_bits(folder):
-    """In the folder's largest file, in three places: one alone can lie in an index that orbax wrote
-    and then replaced, which nobody reads (1 of 250 times on a busy machine)."""
+    """Flips one bit at three places of the folder's largest file.
+
+    One place is not enough: it can lie in an old index of orbax, which nobody reads (1 of 250 times
+    on a busy machine).
+    """
     path = max(folder.iterdir(), key=lambda p: p.stat().st_size)
     data = bytearray(path.read_bytes())
     for quarter in (1, 2, 3):
@@ -447,13 +453,13 @@ def flip_bits(folder):
 class TestDamage:
     @pytest.mark.parametrize("item", ["params", "core", "env"])
     def test_flipped_bits(self, saved, restored, tmp_path, item):
-        """In the numbers, where orbax itself sees nothing."""
+        """The bits are in the numbers, where orbax itself finds no error."""
         saved(tmp_path, 1, 2)
         flip_bits(tmp_path / "checkpoints" / "2" / item / "ocdbt.process_0" / "d")
         step, (warning,) = restored(tmp_path)
         assert step == 1 and "checkpoint 2 is damaged" in warning and "1 is used" in warning
         assert {p.name for p in (tmp_path / "checkpoints").iterdir()} == {"1", "damaged-2"}
-        saved(tmp_path, 2)  # what was damaged is not in the way
+        saved(tmp_path, 2)  # the damaged folder does not prevent the save
         assert restored(tmp_path) == (2, [])
 
     @pytest.mark.parametrize("item", ["params", "core", "env", "meta"])
@@ -466,7 +472,7 @@ class TestDamage:
     def test_policy_with_flipped_bits(self, saved, restored, tmp_path):
         saved(tmp_path, 1)
         flip_bits(tmp_path / "checkpoints" / "1" / "params" / "ocdbt.process_0" / "d")
-        # Orbax sees it in the index, the checksum in the numbers.
+        # Orbax finds damage in the index, the checksum finds it in the numbers.
         said = "the numbers of 'params' are not those|Encountered error while reading"
         with pytest.raises(CheckpointError, match=said):
             policy_lib.load_policy(tmp_path)
@@ -486,7 +492,7 @@ def edit_meta(run_dir, change):
 
 class TestSchema:
     OLD = ROOT / "tests" / "data" / "checkpoint-schema-1"
-    """Two environments, two hidden units, one train step."""
+    """A checkpoint with two environments and two hidden units, after one train step."""
 
     def test_policy_of_schema_1(self):
         policy = policy_lib.load_policy(self.OLD)
@@ -504,7 +510,8 @@ class TestSchema:
         assert [p.name for p in (run / "checkpoints").iterdir()] == ["1"]
 
     def test_tree_of_this_schema(self, like):
-        """Another tree needs another SCHEMA_VERSION, or old checkpoints fail in orbax's words."""
+        """A change of the tree needs a new SCHEMA_VERSION. Else old checkpoints fail with errors of
+        orbax."""
         stored = (
             ROOT / "tests" / "data" / f"train_state_schema_{checkpoint_format.SCHEMA_VERSION}.txt"
         )
@@ -667,7 +674,7 @@ class TestDoctor:
         assert "FAIL" in out and "division by zero" in out and "install another" in out
 
     def test_a_package_that_cannot_be_imported_is_no_traceback(self, monkeypatch, capsys):
-        """The table is there for machines where JAX or orbax is broken."""
+        """The table must also work on machines with a broken JAX or orbax."""
         for name in ("jax", "orbax.checkpoint", "kslc_jax.policy"):
             monkeypatch.setitem(sys.modules, name, None)
         monkeypatch.setattr(doctor, "CHECKS", (("jax", doctor.check_jax, "install another"),))
@@ -710,8 +717,8 @@ def twenty_steps(init, step):
 
 class TestDeterminism:
     def test_two_inits_and_any_number_of_threads(self, made, monkeypatch):
-        """Bit-identical metrics and state; the step is compiled once, the simulator's threads are
-        changed under it."""
+        """Metrics and state are bit-identical. The step is compiled once; only the simulator's
+        number of threads changes."""
         init, step = made
         rows, real = [twenty_steps(init, step)], physics._batch
         for threads in (1, 2):
@@ -727,7 +734,7 @@ class TestDeterminism:
     @pytest.mark.slow(reason="compiles a train step with each engine, twice")
     @pytest.mark.parametrize("engine", ["mujoco", "mjx"])
     def test_two_processes(self, engine, like, tmp_path):
-        """Two processes with one seed; with the mujoco engine on one thread and on two."""
+        """Two processes with the same seed, one with one physics thread and one with two."""
         rows, sums = [], []
         for i in (1, 2):
             args = ["--preset", "debug", "--steps", 20 * 128, "--run-dir", tmp_path / str(i)]
@@ -748,7 +755,7 @@ class TestDeterminism:
 
 @pytest.mark.slow(reason="starts five trainings, each of which compiles")
 def test_kills(tmp_path):
-    """The kill harness in small: two SIGKILLs, one SIGTERM, then bit-identical metrics."""
+    """The kill test in small: after two SIGKILLs and one SIGTERM the metrics are bit-identical."""
     command = [sys.executable, str(ROOT / "benchmarks" / "kill_test.py"), "--kills", "2"]
     command += ["--terms", "1", "--folder", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=550)

@@ -1,4 +1,4 @@
-"""Gait clock, stance mask, reference pose, air time and swing height, worked out by hand."""
+"""Gait clock, stance mask, reference pose, air time and swing height, against values by hand."""
 
 import dataclasses
 import functools
@@ -26,7 +26,7 @@ def update(config: GaitConfig, state, signals, command, cycle_time):
 
 
 def at_phase(phase: float, command=None, config: GaitConfig = PAPER) -> gait.GaitState:
-    """State whose clock has just reached `phase`; a still clock, it hardly moves in one step."""
+    """State at `phase`. The cycle is very long, so that the clock hardly moves in the step."""
     start = make_gait(phase=phase, stance=[False, False], clock=[9.0, 9.0])
     command = make_command() if command is None else command
     return update(config, start, make_signals(), command, jnp.asarray(1e9))
@@ -69,14 +69,14 @@ def test_clock(phase, sin, cos):
 @pytest.mark.parametrize(
     ("vx", "phase", "left", "right"),
     [
-        (0.0, 0.0159, True, True),  # walking: as without
-        (3.5, 0.0, False, False),  # at full speed both fly where abs(sin) < 0.3
+        (0.0, 0.0159, True, True),  # slow: double support as before
+        (3.5, 0.0, False, False),  # at full speed both feet fly while abs(sin) < 0.3
         (3.5, 0.0484, False, False),  # sin = 0.2992
         (3.5, 0.0486, True, False),  # sin = 0.3004
         (-3.5, 0.0484, False, False),
         (7.0, 0.0486, True, False),
-        (1.75, 0.0001, True, False),  # (1.75 / 3.5)^2 (0.3 + 0.1) = 0.1: neither
-        (2.475, 0.0158, False, False),  # half way: flight below 0.1
+        (1.75, 0.0001, True, False),  # (1.75 / 3.5)^2 (0.3 + 0.1) = 0.1: neither overlap nor flight
+        (2.475, 0.0158, False, False),  # half way: both fly while abs(sin) < 0.1
         (2.475, 0.0161, True, False),
     ],
 )
@@ -87,7 +87,8 @@ def test_double_support_turns_into_flight_with_the_square_of_the_speed(vx, phase
 
 
 def test_mean_velocity_forgets_over_a_cycle():
-    """First order, dt / cycle = 0.01 / 0.5 a step: 1 - 0.98^50 = 0.6358 after a cycle at 1 m/s."""
+    """A first-order filter with dt / cycle = 0.01 / 0.5 a step. After one cycle at 1 m/s it is at
+    1 - 0.98^50 = 0.6358."""
     state, signals = make_gait(), make_signals(base_linvel=[1.0, -2.0, 5.0])
     for _ in range(50):
         state = update(PAPER, state, signals, make_command(), jnp.asarray(0.5))
@@ -95,7 +96,7 @@ def test_mean_velocity_forgets_over_a_cycle():
 
 
 def test_clock_runs_once_around_in_a_cycle():
-    """0.01 / 0.64 = 1/64 is exact: a quarter after 16 steps, back at 0 after 64."""
+    """A step is 0.01 / 0.64 = 1/64 of a cycle: a quarter after 16 steps, back at 0 after 64."""
     state, phases = make_gait(), []
     for _ in range(64):
         state = update(PAPER, state, make_signals(), make_command(), jnp.asarray(0.64))
@@ -146,7 +147,7 @@ def test_random_phase_fills_the_cycle():
     ],
 )
 def test_cycle_time(follows, vx, expected):
-    """0.64 + g (0.48 - 0.64) where it follows the speed; g = 0.5 at 1.75 of 3.5 m/s."""
+    """If the cycle follows the speed: 0.64 + g (0.48 - 0.64), with g = 0.5 at 1.75 of 3.5 m/s."""
     config = with_gait(cycle_follows_speed=follows)
     command = make_command(velocity=[vx, 0.0, 0.0])
     got = gait.cycle_time(config, command, jnp.asarray(0.48), jnp.asarray(3.5))
@@ -160,7 +161,7 @@ def with_gait(**changes):
 
 @pytest.mark.parametrize("vx", [0.0, 0.3, 0.5, -0.3, 0.75, 1.0, 2.0, 3.3])
 def test_the_cycle_of_a_command_is_the_same_for_every_range(vx):
-    """0.64 x 0.925^((v - 0.5) / 0.5): what it was when v was the top of the range."""
+    """It is 0.64 x 0.925^((v - 0.5) / 0.5): the curriculum's cycle when v was its top speed."""
     config, command = preset("laptop"), make_command(velocity=[vx, 0.0, 0.0])
     state, found = curriculum.init(config), []
     open_ = dataclasses.replace(config.curriculum, cycle_min=0.38)
@@ -176,7 +177,8 @@ def test_the_cycle_of_a_command_is_the_same_for_every_range(vx):
 
 
 def test_the_cycle_is_never_below_the_curriculums():
-    """Without the cycle curriculum (an ablation) it stays as it is; at the end 0.38 s is left."""
+    """Without the cycle curriculum (an ablation) the cycle stays 0.64 s. At the end of the
+    curriculum it is 0.38 s."""
     config, command = preset("laptop"), make_command(velocity=[4.5, 0.0, 0.0])
     assert float(gait.cycle_time(config, command, 0.64, 4.5)) == pytest.approx(0.64)
     assert float(gait.cycle_time(config, command, 0.38, 4.5)) == pytest.approx(0.38)
@@ -207,7 +209,7 @@ RIGHT_SWINGS = joints(right_leg_pitch=0.17, right_knee=0.34, right_ankle_pitch=0
     ],
 )
 def test_reference_pose_is_humanoid_gyms(phase, expected):
-    """min(s, 0) (a, 2a, a) on the left, max(s, 0) (a, 2a, a) on the right, a = 0.17."""
+    """Left leg min(s, 0) (a, 2a, a), right leg max(s, 0) (a, 2a, a), with a = 0.17."""
     for vx in (0.0, 3.5):
         np.testing.assert_allclose(pose(phase, vx), expected, atol=1e-6)
 
@@ -245,8 +247,8 @@ def test_arm_reference(phase, vx, swing, bend):
     [(0.0, 3.5, 0.4), (0.5, 3.5, -0.4), (0.25, 3.5, 0.0), (0.0, 1.75, 0.2)],
 )
 def test_hips_sweep(phase, vx, sweep):
-    """cos = 1 at the left foot's touchdown: left leg in front (negative), right leg behind, whose
-    axis is mirrored (negative as well)."""
+    """At the left foot's touchdown cos = 1. The left leg is in front, which is negative. The right
+    leg is behind; its axis is mirrored, so this is negative too."""
     config = dataclasses.replace(PAPER, stride_sweep=0.4)
     expected = pose(phase, vx) + joints(left_leg_pitch=-sweep, right_leg_pitch=-sweep)
     np.testing.assert_allclose(pose(phase, vx, config), expected, atol=1e-6)
@@ -275,7 +277,8 @@ def body_positions(q: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def test_reference_moves_the_body_as_it_should():
-    """Against the model: the swing leg comes up with its knee forward, arms oppose the legs."""
+    """In the robot model the swing leg comes up with its knee forward, and arms move opposite to
+    the legs."""
     rest, left = body_positions(np.zeros(16)), body_positions(np.asarray(pose(0.75)))
     assert left["left_ankle_roll_link"][2] - rest["left_ankle_roll_link"][2] > 0.02
     assert left["left_knee_link"][0] - rest["left_knee_link"][0] > 0.04
@@ -289,7 +292,8 @@ def test_reference_moves_the_body_as_it_should():
 
 
 def test_elbow_reference_bends_the_forearm_forward():
-    """The forearm's centre of mass hangs below the elbow; a right angle puts it ahead."""
+    """The centre of mass of the forearm hangs below the elbow. A bend of 1.5 rad puts it in front
+    of the elbow."""
     model = robot.load().mj_model
     data = mujoco.MjData(model)
     for side, sign in (("left", 1.0), ("right", -1.0)):
@@ -304,7 +308,10 @@ def test_elbow_reference_bends_the_forearm_forward():
 
 
 def play(contacts, feet_z, phase=0.25, cycle_time=1e9, state=None):
-    """The states of successive steps; the clock stands at `phase`: left stance, right swing."""
+    """The states of successive steps with the given contacts and foot heights [m].
+
+    By default the clock stays at `phase`, where the left foot is in stance and the right in swing.
+    """
     state = make_gait(contact=[False, False], phase=phase) if state is None else state
     out = []
     for contact, z in zip(contacts, feet_z, strict=True):
@@ -317,20 +324,20 @@ def play(contacts, feet_z, phase=0.25, cycle_time=1e9, state=None):
 
 
 def test_air_time_and_landing():
-    """In the air from the second step without contact on; the landing step counts as well."""
+    """A foot is in the air from the second step without contact on. The landing step counts too."""
     right = [True, False, False, False, True, True, False, False]
     states = play([(False, c) for c in right], [(0.05, 0.05)] * 8)
     air = [round(float(s.air_time[1]), 4) for s in states]
     landing = [round(float(s.landing[1]), 4) for s in states]
     assert air == [0.0, 0.0, 0.01, 0.02, 0.0, 0.0, 0.0, 0.01]
     assert landing == [0.0, 0.0, 0.0, 0.0, 0.03, 0.0, 0.0, 0.0]
-    # The clock has the left foot down throughout, contact or not.
+    # The clock has the left foot in stance all the time, so contact does not matter.
     assert all(float(s.air_time[0]) == float(s.landing[0]) == 0.0 for s in states)
     assert [s.contact.tolist() for s in states] == [[False, c] for c in right]
 
 
 def test_the_clock_alone_ends_the_air_time():
-    """Right foot in the air while the phase goes 0.46, 0.47, 0.48, 0.49 (double support)."""
+    """The right foot is in the air while the phase goes 0.46, 0.47, 0.48, 0.49 (double support)."""
     states = play([(True, False)] * 4, [(0.05, 0.2)] * 4, phase=0.45, cycle_time=1.0)
     assert [round(float(s.phase), 4) for s in states] == [0.46, 0.47, 0.48, 0.49]
     assert [round(float(s.air_time[1]), 4) for s in states] == [0.01, 0.02, 0.03, 0.0]
@@ -342,13 +349,14 @@ def test_swing_height_is_above_the_last_contact():
     contact = [True, False, False, True, True, False]
     states = play([(True, c) for c in contact], [(0.05, h) for h in z])
     heights = [round(float(s.swing_height[1]), 5) for s in states]
-    # Lands on a step 2 cm high: measured from the old contact when it lands, then from the new.
+    # The foot lands 2 cm higher. In that step the height is relative to the old contact, then to
+    # the new one.
     assert heights == [0.0, 0.03, 0.07, 0.02, 0.0, 0.03]
     np.testing.assert_allclose([s.lift_z[1] for s in states], [0.05] * 3 + [0.07] * 3)
 
 
 def test_bookkeeping_is_humanoid_gyms_over_random_contacts():
-    """Its running sums, written out: reward methods that change state, in their order."""
+    """Humanoid-Gym's running sums, written out. Its reward methods change state, in this order."""
     rng = np.random.default_rng(0)
     steps = 150
     contacts = rng.random((steps, 2)) < 0.3

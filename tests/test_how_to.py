@@ -1,4 +1,4 @@
-"""The recipes of docs/how_to.md: each is executed as it stands, with tiny sizes."""
+"""The recipes of docs/how_to.md: each runs as written, but with tiny sizes."""
 
 import os
 import re
@@ -21,7 +21,7 @@ TINY = {
     "--speeds 1 2 --seeds 8 --seconds 20": "--speeds 1 --seeds 1 --seconds 3",
     "--seconds 10": "--seconds 1",
 }
-"""What a snippet says, and what the test runs in its place."""
+"""Text in a snippet, and the text that the test runs in its place."""
 
 CHANGES = ("Add a reward", "Add an observation", "Train a variant of the robot")
 """Recipes that change the source code."""
@@ -52,13 +52,13 @@ def tiny(text: str) -> str:
 
 
 def environment(package: Path) -> dict[str, str]:
-    """A child's environment: `python` is this one, and it imports the copy in `package`."""
+    """Environment of a child: `python` is this interpreter; it imports the code in `package`."""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     return {**os.environ, "PATH": path, "PYTHONPATH": str(package), "JAX_PLATFORMS": "cpu"}
 
 
 def shell(command: list[str], cwd: Path, package: Path) -> str:
-    """What a child wrote; its exit code must be 0."""
+    """Runs a child, whose exit code must be 0; returns its stdout."""
     done = subprocess.run(
         command, cwd=cwd, env=environment(package), capture_output=True, text=True, check=False
     )
@@ -67,8 +67,8 @@ def shell(command: list[str], cwd: Path, package: Path) -> str:
 
 
 def change(text: str, root: Path) -> None:
-    """Applies a diff: "+++ FILE" names the file, "@@" parts two places in it; the lines that are
-    there already must be there once."""
+    """Applies a diff. "+++ FILE" names the file, and "@@" separates two places in it. The old lines
+    of each place must occur exactly once in the file."""
     for part in re.split(r"^\+\+\+ ", text, flags=re.M)[1:]:
         name, body = part.split("\n", 1)
         file = root / name
@@ -94,7 +94,7 @@ def test_every_recipe_is_listed_and_executed():
 
 
 def test_changes_of_the_code(tmp_path):
-    """One copy of the package takes all changes; the new tests run in it, and can fail."""
+    """All changes go into one copy of the package, and the new tests run in it."""
     shutil.copytree(ROOT / "kslc_jax", tmp_path / "kslc_jax", symlinks=True)
     shutil.copytree(ROOT / "tests", tmp_path / "tests", ignore=shutil.ignore_patterns("data"))
     blocks = [block for name in CHANGES for block in recipes()[name]]
@@ -113,7 +113,7 @@ def test_changes_of_the_code(tmp_path):
 
 
 def execute(name: str, folder: Path, monkeypatch) -> None:
-    """Runs the blocks of a recipe one after the other: sh in a child, python in this process."""
+    """Runs the blocks of a recipe in order: sh in a child, python in this process."""
     monkeypatch.chdir(folder)
     for language, text in recipes()[name]:
         if language == "sh":

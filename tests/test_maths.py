@@ -1,4 +1,4 @@
-"""Quaternions and angles against hand values, rotation matrices and their own laws."""
+"""Quaternions and angles against values by hand, rotation matrices and their algebraic laws."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from kslc_jax import maths
 HALF = 0.70710678  # cos 45 degrees: quaternions of quarter turns
 X, Y, Z = np.eye(3, dtype=np.float32)
 
-# Compiled once; hypothesis then costs little.
+# Compiled once, so that the many examples of hypothesis are cheap.
 rotate = jax.jit(maths.quat_rotate)
 rotate_inverse = jax.jit(maths.quat_rotate_inverse)
 to_euler = jax.jit(maths.quat_to_euler)
@@ -25,7 +25,7 @@ vectors = st.tuples(*[st.floats(-10, 10)] * 3)
 
 
 def matrix(roll, pitch, yaw):
-    """Rz(yaw) Ry(pitch) Rx(roll), written out."""
+    """Rotation matrix Rz(yaw) Ry(pitch) Rx(roll), written out."""
     cr, cp, cy = np.cos([roll, pitch, yaw])
     sr, sp, sy = np.sin([roll, pitch, yaw])
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
@@ -35,7 +35,7 @@ def matrix(roll, pitch, yaw):
 
 
 def quaternion(roll, pitch, yaw):
-    """q_z q_y q_x by the Hamilton product, from half angles."""
+    """Quaternion q_z q_y q_x by the Hamilton product of half-angle quaternions."""
 
     def product(a, b):
         w, u, s, v = a[0], a[1:], b[0], b[1:]
@@ -94,11 +94,11 @@ def test_inverse_undoes_and_length_stays(roll, pitch, yaw, vector):
         ([HALF, HALF, 0, 0], [np.pi / 2, 0, 0]),
         ([HALF, 0, 0, HALF], [0, 0, np.pi / 2]),
         ([HALF, 0, 0, -HALF], [0, 0, -np.pi / 2]),
-        # Half angles 0.05, 0.1, 0.15 about one axis each: twice that.
+        # Half angles 0.05, 0.1, 0.15 about one axis each give angles twice as large.
         ([0.99875026, 0.04997917, 0, 0], [0.1, 0, 0]),
         ([0.99500417, 0, 0.09983342, 0], [0, 0.2, 0]),
         ([0.98877108, 0, 0, 0.14943813], [0, 0, 0.3]),
-        # Quarter turn in yaw, then half angle 0.1 of pitch: HALF * (cos, -sin, sin, cos).
+        # A quarter turn in yaw and a half angle of 0.1 in pitch: HALF * (cos, -sin, sin, cos).
         ([0.70357418, -0.07059289, 0.07059289, 0.70357418], [0, 0.2, np.pi / 2]),
     ],
 )
@@ -109,7 +109,7 @@ def test_euler_by_hand(quat, euler):
 
 
 def test_euler_looking_straight_down_is_finite():
-    """w y - z x may round to just above 1/2."""
+    """w y - z x may round to a number just above 1/2."""
     quat = jnp.array([0.7071069, 0.0, 0.7071069, 0.0])
     assert float(maths.quat_to_euler(quat)[1]) == pytest.approx(np.pi / 2, abs=1e-3)
 
@@ -117,7 +117,7 @@ def test_euler_looking_straight_down_is_finite():
 @quick
 @given(angles, pitches, angles)
 def test_euler_round_trip(roll, pitch, yaw):
-    """float32 arcsin loses digits towards 90 degrees of pitch: 1e-4 up to 1.5 rad."""
+    """Near 90 degrees of pitch the float32 arcsin loses digits: 1e-4 up to 1.5 rad."""
     np.testing.assert_allclose(
         to_euler(quaternion(roll, pitch, yaw)), [roll, pitch, yaw], atol=1e-4
     )

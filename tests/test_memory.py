@@ -1,4 +1,4 @@
-"""What a training is reckoned to take, in numbers worked out by hand."""
+"""The memory estimate of a training against numbers worked out by hand."""
 
 import dataclasses
 import functools
@@ -18,7 +18,7 @@ def update(config: Config, devices: int = 1) -> float:
 
 
 SAMPLE = 4 * (16 + 16 + 5) + 1
-"""Bytes: action, mean; index, log_prob, value, advantage, target; and if it is valid."""
+"""Bytes of one sample: action, mean; index, log_prob, value, advantage, target; valid."""
 
 
 def test_update_of_the_debug_preset(debug):
@@ -39,7 +39,7 @@ def test_update_of_the_paper_preset():
 
 
 def test_rollout():
-    """Where there are many environments and few steps, the control step is what counts."""
+    """The rollout needs memory for the trajectory and for the control step of the environments."""
     physics = dataclasses.replace(PAPER.physics, engine="mjx")
     mjx = dataclasses.replace(PAPER, physics=physics)
     mujoco = dataclasses.replace(PAPER, physics=dataclasses.replace(PAPER.physics, engine="mujoco"))
@@ -53,7 +53,7 @@ def test_rollout():
 
 
 def test_shapes_are_those_of_the_program(debug):
-    """The physics that is left out changes none."""
+    """The estimate leaves the physics out of the rollout; the shapes do not depend on it."""
     state = jax.eval_shape(lambda: train_step.init(debug, 0))
     args = state.learner.params, state.env, state.curriculum, state.key
     _, trajectory = jax.eval_shape(functools.partial(rollout.collect, debug), *args)

@@ -1,4 +1,4 @@
-"""Actor and critic: what mirroring does to them, and how they start."""
+"""Actor and critic: mirror symmetry, sizes, initial output, and the velocity estimate."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ KEY = jax.random.key(3)
 
 
 def perturbed(config):
-    """Parameters with nothing at its special initial value."""
+    """Initial parameters plus noise, so that none has its special initial value."""
     params = networks.init(config, KEY)
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(KEY, len(leaves))
@@ -103,7 +103,8 @@ def test_networks_have_the_papers_sizes():
 
 
 def test_the_estimate_mirrors_and_only_its_own_error_trains_it():
-    """vy changes its sign. The actor reads the estimate, its loss does not change the estimator."""
+    """In the mirror vy changes its sign. The actor reads the estimate, but the actor's gradient
+    does not reach the estimator."""
     params = perturbed(CONFIG)
     history = jax.random.normal(KEY, (CONFIG.env.frames, observations.ACTOR_WIDTH))
     here = networks.policy_and_estimate(CONFIG, params, history)[1]

@@ -1,4 +1,4 @@
-"""The notebooks: tidy as they are stored, and running from top to bottom in their short mode."""
+"""The notebooks: the stored files are tidy, and they run from top to bottom in their short mode."""
 
 import math
 import re
@@ -16,7 +16,7 @@ NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum")
 
 MOST_BYTES = 1_000_000
 MOST_LINES = 16
-"""Of a cell: a notebook calls the package, it has no logic of its own."""
+"""Limit for a cell: a notebook calls the package and has no logic of its own."""
 
 
 def read(name: str) -> nbformat.NotebookNode:
@@ -28,7 +28,7 @@ def outputs(notebook: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 
 
 def text(notebook: nbformat.NotebookNode) -> str:
-    """All that the cells have written."""
+    """The text output of all cells."""
     parts = [
         out.get("text") or out.get("data", {}).get("text/plain", "") for out in outputs(notebook)
     ]
@@ -41,7 +41,7 @@ def pictures(notebook: nbformat.NotebookNode) -> int:
 
 @pytest.fixture
 def execute(tmp_path, monkeypatch):
-    """Runs a notebook in a copy of the folders that it reads, on the CPU and shortened."""
+    """Runs a notebook in its short mode, on the CPU, in a temporary folder with `docs`."""
     monkeypatch.setenv("KSLC_SHORT", "1")
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     (tmp_path / "notebooks").mkdir()
@@ -58,7 +58,7 @@ def execute(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_stored_as_run(name):
-    """Cells are short and were run in order without an error; pictures are in, files are small."""
+    """Cells are short and ran in order without an error. The file has pictures and is small."""
     notebook = read(name)
     nbformat.validate(notebook)
     cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -72,7 +72,8 @@ def test_stored_as_run(name):
 
 @pytest.mark.slow(reason="a minute: renders a video and compiles a train step")
 def test_quickstart(execute):
-    """Three updates, counted and finite; strip and curve, or a word on why there is no strip."""
+    """Three updates with finite rewards. There are a strip and a curve, or a line that says why
+    there is no strip."""
     notebook = execute("01_quickstart")
     rewards = [float(x) for x in re.findall(r"update .* reward (-?[\d.]+)", text(notebook))]
     assert len(rewards) == 3 and all(map(math.isfinite, rewards))
@@ -82,7 +83,7 @@ def test_quickstart(execute):
 
 
 def test_quickstart_where_nothing_can_be_drawn(tmp_path, monkeypatch):
-    """A GL that is there and does not work is a word to the reader, not an error."""
+    """If GL is installed but does not work, the notebook prints a line and does not fail."""
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
     monkeypatch.setenv("PYOPENGL_PLATFORM", "nonsense")
     notebook = read("01_quickstart")
@@ -94,7 +95,7 @@ def test_quickstart_where_nothing_can_be_drawn(tmp_path, monkeypatch):
 
 @pytest.mark.slow(reason="a minute: two trainings, and trials of a policy")
 def test_train_and_evaluate(execute, tmp_path):
-    """The second training goes on where the first stopped; the table has a row per speed."""
+    """The second training resumes the first one. The table has a row per speed."""
     notebook = execute("02_train_and_evaluate")
     assert "no GPU: on one" in text(notebook)
     assert "resumed at train step 4" in text(notebook)
@@ -105,7 +106,7 @@ def test_train_and_evaluate(execute, tmp_path):
 
 
 def test_rewards_and_curriculum(execute):
-    """What the notebook prints is what the formulas give by hand."""
+    """The printed numbers equal the formulas worked out by hand."""
     notebook = execute("03_rewards_and_curriculum")
     printed, read = -math.exp(5.0), 1.0 - math.exp(1.0)
     assert f"printed {printed:.1f}, as read {read:.3f}" in text(notebook)
@@ -121,7 +122,8 @@ def test_rewards_and_curriculum(execute):
 
 
 def test_the_reward_terms_shown_are_there_and_told():
-    """The paper's four one by one; others as one panel, and in a sentence."""
+    """The notebook plots each of the paper's four terms alone. The other terms share figures, and
+    each has a sentence."""
     cells = read("03_rewards_and_curriculum").cells
     code, prose = (
         "\n".join(cell.source for cell in cells if cell.cell_type == kind)
@@ -135,7 +137,8 @@ def test_the_reward_terms_shown_are_there_and_told():
 
 
 def test_without_a_checkout_the_address_is_asked_for(tmp_path, monkeypatch):
-    """Rather than what git says of a repository that nobody has; the same cell in all of them."""
+    """The error asks for the address, instead of git's error about a missing repository. All
+    notebooks have the same cell."""
     monkeypatch.delenv("KSLC_REPO", raising=False)
     first, *others = (
         [cell for cell in read(name).cells if "git clone" in cell.source] for name in NAMES

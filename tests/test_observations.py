@@ -1,4 +1,4 @@
-"""Frames against literal tables: order, scales, noise, history and mirroring."""
+"""Frames against tables typed by hand: order, scales, noise, history and mirroring."""
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from kslc_jax.physics import PhysicsState, initial_state
 KEY = jax.random.key(0)
 QUIET = EnvConfig(noise_level=0.0)
 
-# Distinct numbers for everything a frame holds.
+# Different numbers for all components of a frame.
 Q = 0.01 * np.arange(1, 17)
 DQ = 1.0 + 0.1 * np.arange(16)
 ACTION = -2.0 + 0.2 * np.arange(16)
@@ -53,7 +53,7 @@ def test_widths():
     assert observations.width(ACTOR) == 59 and observations.width(CRITIC) == 89
 
 
-# The paper's Table II: component, dims, in the observation, in the state.
+# The paper's Table II: component, width, True if the actor sees it. The critic sees all.
 TABLE_II = [
     (("clock",), 2, True),
     (("command",), 3, True),
@@ -123,7 +123,7 @@ def test_every_component_has_a_value():
 
 # ------------------------------------------------------------------------------------------ frames
 
-# vx, vy x 2, yaw rate x 1; joint speed x 0.05; linear velocity x 2; mass / 30.
+# Scales: vx and vy x 2, yaw rate x 1, joint speed x 0.05, linear velocity x 2, mass / 30.
 ACTOR_FRAME = np.concatenate(
     [[0.6, 0.8], [4.0, -0.6, 0.7], Q, 0.05 * DQ, ACTION, [0.3, -0.4, 0.5], [0.01, 0.02, -3.0]]
 )
@@ -166,7 +166,7 @@ def test_frames_are_clipped_at_18():
     assert float(jnp.max(jnp.abs(critic))) == 3.0
 
 
-# Level 0.6 times 0.05, 0.5 (on top of the scale 0.05), 0.1 and 0.03.
+# Noise level 0.6 times 0.05, 0.5 (times the scale 0.05), 0.1 and 0.03.
 NOISE = np.concatenate(
     [np.zeros(5), np.full(16, 0.03), np.full(16, 0.015), np.zeros(16), [0.06] * 3, [0.018] * 3]
 )
@@ -174,7 +174,7 @@ NOISE = np.concatenate(
 
 @pytest.fixture(scope="module")
 def noisy():
-    """Deviations of 4000 noisy frames from the clean one: [4000, 59], at level 0.6."""
+    """Deviations of 4000 noisy frames from the clean frame: [4000, 59], at noise level 0.6."""
     frame = jax.jit(
         jax.vmap(lambda key: observations.actor_frame(EnvConfig(), make_sources(), key))
     )
@@ -187,7 +187,7 @@ def test_noise_has_the_tables_size(noisy):
 
 
 def test_noise_is_gaussian_and_independent(noisy):
-    """5 % lie beyond two deviations, and no two numbers share their noise."""
+    """5 % lie beyond 1.96 standard deviations, and no two numbers share their noise."""
     z = noisy[:, NOISE > 0] / NOISE[NOISE > 0]
     assert np.mean(np.abs(z) > 1.959964) == pytest.approx(0.05, abs=0.003)
     correlation = np.corrcoef(z.T) - np.eye(z.shape[1])
@@ -235,7 +235,7 @@ def test_presets_have_the_papers_history():
 
 # ------------------------------------------------------------------------------------------ mirror
 
-# By hand: swap the sides, negate every joint. Legs are 0 to 5 and 6 to 11, arms 12, 13 and 14, 15.
+# By hand: swap the sides and negate every joint. Legs: 0 to 5, 6 to 11. Arms: 12, 13 and 14, 15.
 PARTNER = [6, 7, 8, 9, 10, 11, 0, 1, 2, 3, 4, 5, 14, 15, 12, 13]
 
 
@@ -262,7 +262,7 @@ def test_mirror_is_an_involution_on_any_frame(values):
 
 
 def mirrored_sources() -> observations.Sources:
-    """The sources of the robot seen in a mirror that stands along its x-z plane."""
+    """The sources of the robot mirrored at its x-z plane."""
     return make_sources(
         signals=make_signals(
             joint_pos=mirrored(Q),
@@ -297,7 +297,8 @@ def test_frame_of_the_mirrored_state_is_the_mirrored_frame():
 
 
 def test_mirrored_physics_gives_the_mirrored_frame(xbot):
-    """From qpos and qvel through signals and gait: y, roll, yaw and their rates change sign."""
+    """The mirrored qpos and qvel go through signals and gait. In the mirror y, roll, yaw and their
+    rates change sign."""
     config = PhysicsConfig()
     rng = np.random.default_rng(0)
     q, dq = rng.uniform(-0.5, 0.5, 16), rng.uniform(-5, 5, 16)
@@ -361,7 +362,7 @@ def test_mirror_of_the_joints_is_the_robots():
 
 
 def test_signals_are_what_they_are_called(xbot):
-    """By hand, of a robot turned and moving at random."""
+    """Signals of a robot with random pose and velocity, against numpy."""
     rng = np.random.default_rng(0)
     quat = rng.normal(size=4)
     quat /= np.linalg.norm(quat)

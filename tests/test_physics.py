@@ -21,13 +21,13 @@ def make_step(engine: str, **changes):
 
 
 def standing(config: PhysicsConfig) -> physics.PhysicsState:
-    """Feet on the floor, at rest."""
+    """State of a robot at rest with its feet on the floor."""
     qpos = jnp.asarray(physics.robot_for(config).default_qpos, jnp.float32).at[2].set(0.885)
     return physics.initial_state(config, qpos, jnp.zeros(22))
 
 
 class TestMotorTorque:
-    """Hand-computed; the left knee has kp 350, kd 10, 212.5 N m, 12 rad/s."""
+    """By hand. The left knee has kp 350, kd 10, effort limit 212.5 N m, speed limit 12 rad/s."""
 
     KNEE = 3
 
@@ -56,7 +56,8 @@ class TestMotorTorque:
         ],
     )
     def test_driving_torque_falls_to_zero_at_the_speed_limit_and_brakes_beyond(self, dq, available):
-        """75 % of 12 rad/s is 9; half way to 12 is 10.5. Braking (dq < 0) keeps all of it."""
+        """The torque falls from 9 rad/s on, 75 % of 12; half is left at 10.5. Braking (dq < 0)
+        keeps the full torque."""
         assert self.torque(dq=dq, target=5.0) == pytest.approx(available, abs=1e-4)
         assert self.torque(dq=-dq, target=-5.0) == pytest.approx(-available, abs=1e-4)
 
@@ -82,7 +83,7 @@ class TestMotorTorque:
 
 class TestMotorDamping:
     def test_of_a_servo_within_its_limits(self, xbot):
-        """0.6 of the PD's kd wherever the torque is the PD's at both ends of the step."""
+        """The damping is 0.6 kd where no limit changes the PD torque at both ends of the step."""
         rng = np.random.default_rng(3)
         q, dq, target = rng.normal(size=(3, 16)) * [[0.05], [0.5], [0.05]]
         torque = motors.motor_torque(xbot, randomize.nominal(), q, dq, target, np)
@@ -92,8 +93,8 @@ class TestMotorDamping:
     @pytest.mark.parametrize("dq", [-18.0, -4.0, 0.0, 8.0, 11.0, 18.0])
     @pytest.mark.parametrize("target", [-4.0, 0.3, 4.0])
     def test_a_joint_alone_moves_by_the_theta_method(self, xbot, dq, target):
-        """M dv = h (0.4 torque(dq) + 0.6 torque(dq + dv)), found by bisection, is what the damping
-        gives the integrator."""
+        """The speed after a step with this damping solves the theta-method's equation
+        M dv = h (0.4 torque(dq) + 0.6 torque(dq + dv)). Bisection finds its solution."""
         dyn, h = randomize.nominal(), xbot.mj_model.opt.timestep
         q, dq, target = np.zeros(16), np.full(16, dq), np.full(16, target)
 
@@ -112,7 +113,8 @@ class TestMotorDamping:
         assert np.all(damping > -1e-6)
 
     def test_inertia_of_a_joint_alone(self, xbot):
-        """1 N m for one short step in the air, nothing else, at each joint in turn."""
+        """In the air, 1 N m at each joint in turn: the change of its acceleration gives the
+        inertia."""
         data = mujoco.MjData(xbot.mj_model)
         for i in range(16):
             mujoco.mj_resetDataKeyframe(xbot.mj_model, data, xbot.mj_model.keyframe("home").id)
@@ -127,7 +129,7 @@ class TestMotorDamping:
 
 
 def test_servo_control_inverts_the_models_servo(xbot):
-    """kp (ctrl - q) - damping dq of the model equals the wanted torque."""
+    """The model's servo torque, kp (ctrl - q) - damping dq, equals the wanted torque."""
     rng = np.random.default_rng(1)
     q, dq, torque, damping = rng.normal(size=(4, 16)) * [[0.5], [5.0], [100.0], [30.0]]
     ctrl = motors.servo_control(xbot, torque, damping, q, dq)
@@ -144,8 +146,9 @@ def test_servo_control_inverts_the_models_servo(xbot):
     ids=["mjx", "mujoco", "high fidelity"],
 )
 def test_no_motor_drives_a_joint_past_its_speed_limit(config):
-    """Shoulders, then knees, at full command in the air: 7 and 12 rad/s are approached, and passed
-    by 1 % at most. An explicit step of 5 ms would carry an unloaded knee by 20 rad/s."""
+    """Shoulders, then knees, at full command in the air. Their speeds approach the limits, 7 and 12
+    rad/s, and pass them by 1 % at most. An explicit step of 5 ms would change the speed of an
+    unloaded knee by 20 rad/s."""
     step = jax.jit(lambda s, t, d: physics.step(config, s, t, d, GROUND))
     for joints, there, limit in (((12, 14), 3.1, 7.0), ((3, 9), 1.2, 12.0)):
         state = standing(config)
@@ -162,8 +165,8 @@ def test_no_motor_drives_a_joint_past_its_speed_limit(config):
     "config", [PhysicsConfig(engine="mujoco"), HighFidelity()], ids=["train", "high fidelity"]
 )
 def test_braking_brings_a_joint_back_to_its_limit(config):
-    """Knees thrown at 18 rad/s are within 3 % of 12 after 20 ms, though their targets are far
-    ahead; what brakes them pushes back: the momentum of the whole stays what gravity makes it."""
+    """Knees start at 18 rad/s, and their targets are far ahead. After 20 ms they are below 12.4
+    rad/s. The brake torques are internal: only gravity changes the momentum of the whole robot."""
     step = jax.jit(lambda s, t, d: physics.step(config, s, t, d, GROUND))
     robot = physics.robot_for(config)
     state = standing(config)
@@ -179,7 +182,7 @@ def test_braking_brings_a_joint_back_to_its_limit(config):
 
 
 def momentum(robot, state):
-    """Linear momentum of the whole robot [3, kg m/s], world."""
+    """Linear momentum of the whole robot in the world frame [3, kg m/s]."""
     data = mujoco.MjData(robot.mj_model)
     data.qpos[:], data.qvel[:] = state.qpos, state.qvel
     mujoco.mj_forward(robot.mj_model, data)
@@ -189,7 +192,7 @@ def momentum(robot, state):
 
 @pytest.fixture(scope="module")
 def runs():
-    """100 control steps of both engines from standing, small sine targets, 8 environments with
+    """100 control steps of both engines from standing, with small sine targets: 8 environments with
     randomised dynamics."""
     config = RandomizeConfig(kp=(0.9, 1.1), kd=(0.9, 1.1), base_com=(-0.02, 0.02))
     keys = jax.random.split(jax.random.key(0), 8)
@@ -211,9 +214,10 @@ def runs():
 def test_engines_agree_over_100_steps(runs):
     """float32 MJX against float64 C, with the feet in contact from the start.
 
-    While no contact opens or closes the engines agree to 1e-6. Where one does, rounding decides in
-    which step, and a robot about to tip amplifies that: of 8 robots the worst differs by 1e-3 after
-    10 and 0.05 after 100 control steps, the median by less than 1e-4 throughout (qpos, m and rad).
+    While no contact opens or closes, the engines agree to 1e-6. Rounding decides in which step a
+    contact opens or closes, and a robot that tips amplifies the difference. Of 8 robots the worst
+    differs by 1e-3 after 10 control steps and by 0.05 after 100. The median differs by less than
+    1e-4 throughout (qpos, m and rad).
     """
     for i, median, worst in ((4, 1e-6, 1e-4), (9, 1e-5, 2e-3), (99, 1e-4, 0.1)):
         apart = np.abs(runs["mjx"][i].qpos - runs["mujoco"][i].qpos).max(axis=1)
@@ -224,7 +228,7 @@ def test_engines_agree_over_100_steps(runs):
 
 
 def test_torques_and_sensors_agree(runs):
-    """The same, for what the rewards read."""
+    """The engines agree in torques and sensors too, which the rewards read."""
     for name, tolerance in (("torque", 1e-2), ("sensordata", 1e-1)):
         a, b = (getattr(runs[engine][9], name) for engine in ENGINES)
         assert np.median(np.abs(a - b).max(axis=1)) < tolerance
@@ -232,7 +236,7 @@ def test_torques_and_sensors_agree(runs):
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_legs_do_not_pass_through_each_other(engine):
-    """In the air, both hips told to close: the feet come to rest side by side."""
+    """In the air, both hips close. The feet come to rest side by side."""
     qpos = jnp.asarray(robot.load().default_qpos, jnp.float32).at[2].set(5.0)
     state = physics.initial_state(PhysicsConfig(engine=engine), qpos, jnp.zeros(22))
     step = make_step(engine)
@@ -279,13 +283,13 @@ def test_a_batch_is_its_members():
 
 
 def test_friction_is_the_mean_of_foot_and_ground(xbot):
-    """(0.4 + 0.6) / 2; the model file says 1."""
+    """(0.4 + 0.6) / 2 = 0.5. The model file has 1."""
     fields = randomize.model_fields(xbot, randomize.nominal(0.4), GROUND)
     np.testing.assert_allclose(fields["geom_friction"][xbot.foot_geom_ids, 0], 0.5)
 
 
 def test_added_mass_weighs(xbot):
-    """5 kg more on the base press 49 N more on the ground after settling."""
+    """5 kg more on the base give 49 N more ground force after the robot has settled."""
     step = make_step("mujoco")
     force = []
     for extra in (0.0, 5.0):
@@ -301,7 +305,8 @@ def test_added_mass_weighs(xbot):
 
 
 def test_mass_randomisation_matches_a_recompiled_model(xbot):
-    """body_subtreemass follows: the whole-body CoM sensor equals that of an edited model."""
+    """Masses, centres of mass and subtree masses equal those of an edited model. The CoM sensor
+    needs the subtree masses."""
     fields = randomize.model_fields(
         xbot,
         randomize.nominal().replace(base_mass=jnp.asarray(4.0), base_com=jnp.array([0.05, 0, 0])),
@@ -315,13 +320,13 @@ def test_mass_randomisation_matches_a_recompiled_model(xbot):
     np.testing.assert_allclose(fields["body_subtreemass"], model.body_subtreemass, rtol=1e-6)
     np.testing.assert_allclose(fields["body_mass"], model.body_mass, rtol=1e-6)
     np.testing.assert_allclose(fields["body_ipos"], model.body_ipos, atol=1e-7)
-    # The payload is spread like the base link itself, in proportion to its mass.
+    # The payload scales the base link's inertia with its mass.
     heavier = fields["body_inertia"][base.id] / xbot.mj_model.body_inertia[base.id]
     np.testing.assert_allclose(heavier, base.mass / (base.mass - 4.0), rtol=1e-5)
 
 
 def test_link_randomisation_matches_a_recompiled_model(xbot):
-    """Each link by its own factor and shift, and what the hands carry."""
+    """Each link has its own mass factor and CoM shift, and the hands carry a load."""
     rng = np.random.default_rng(3)
     factor, shift = rng.uniform(0.9, 1.1, 17), rng.uniform(-0.01, 0.01, (17, 3))
     changed = randomize.nominal().replace(
@@ -343,7 +348,7 @@ def test_link_randomisation_matches_a_recompiled_model(xbot):
 
 
 def test_divergence_shows_as_nan_not_as_a_reset():
-    """C MuJoCo would restart a diverged simulation silently; then nobody could mask it."""
+    """C MuJoCo would reset a diverged simulation silently, and the training could not mask it."""
     step = make_step("mujoco")
     state = standing(PhysicsConfig(engine="mujoco"))
     state = state.replace(qvel=state.qvel.at[3].set(jnp.nan))
@@ -351,7 +356,7 @@ def test_divergence_shows_as_nan_not_as_a_reset():
 
 
 def test_sensors_are_those_of_the_new_state(xbot):
-    """Not of one physics step before, which within this motion is up to 0.08 off."""
+    """Sensors of the state one physics step before would differ by up to 0.08 in this motion."""
     step, state = make_step("mujoco"), standing(PhysicsConfig(engine="mujoco"))
     for i in range(10):
         target = 0.05 * jnp.sin(2 * jnp.pi * 0.01 * i + jnp.arange(16.0))

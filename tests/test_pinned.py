@@ -1,7 +1,7 @@
-"""The numbers of 20 train steps of the debug preset, held against a file.
+"""The metrics of 20 train steps of the debug preset, compared with a stored file.
 
-Refactoring must not change a number. A change that is meant to change numbers writes the file anew,
-in the same commit:
+A refactoring must not change a number. A commit that changes numbers on purpose also writes the
+file again:
 
   python -m tests.test_pinned
 """
@@ -24,16 +24,16 @@ FILE = Path(__file__).parent / "data" / "pinned_metrics.json"
 STEPS = 20
 
 FIRST_STEPS = 2
-"""Train steps after which another machine's rounding has not yet grown: a robot is chaotic."""
+"""Train steps to compare on another machine. Later, chaos amplifies its other rounding."""
 
 RELATIVE, ABSOLUTE = 1e-2, 1e-4
-"""Tolerance of the first steps where the machine or a package is another one than the file's."""
+"""Tolerances of the first steps, for a machine or packages other than those of the file."""
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
 
 
 def machine() -> dict[str, str]:
-    """Everything that the last bit of a number depends on."""
+    """The hardware and package versions that decide the last bit of a number."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
@@ -46,7 +46,7 @@ def machine() -> dict[str, str]:
 
 
 def metrics(engine: str, steps: int = STEPS) -> dict[str, list[str]]:
-    """Each metric of the first train steps, as hexadecimal floats: no bit is lost in the file."""
+    """Each metric of the first train steps, as hexadecimal floats, which keep every bit."""
     config = config_lib.preset("debug")
     physics = dataclasses.replace(config.physics, engine=engine)
     init, step = train_step.make(dataclasses.replace(config, physics=physics))
@@ -58,7 +58,7 @@ def metrics(engine: str, steps: int = STEPS) -> dict[str, list[str]]:
 
 
 def check(engine: str) -> None:
-    """Fails where a metric is not the stored one."""
+    """Fails if a metric differs from the stored one."""
     stored = json.loads(FILE.read_text())
     exact = stored["machine"] == machine()
     steps = STEPS if exact else FIRST_STEPS
@@ -82,7 +82,7 @@ def test_numbers_in_mjx_are_pinned():
 
 
 def main() -> None:
-    """Writes the file anew."""
+    """Writes the file again."""
     pinned = {"machine": machine(), **{engine: metrics(engine) for engine in ("mujoco", "mjx")}}
     FILE.write_text(json.dumps(pinned, indent=1) + "\n")
 

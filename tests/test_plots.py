@@ -65,7 +65,7 @@ def test_figures_of_evaluations_are_drawn(figure, evaluations, tmp_path):
 
 
 def test_learning_curves_are_drawn(tmp_path, capsys):
-    """Of runs of different lengths, as seeds of one method."""
+    """The seeds of one method may have different lengths. Different steps or speeds are errors."""
     for name, count in (("kslc-seed0", 5), ("kslc-seed1", 3), ("baseline-seed0", 4)):
         points = [
             {
@@ -99,7 +99,7 @@ def test_learning_curves_are_drawn(tmp_path, capsys):
 
 
 def test_what_nobody_survived_leaves_a_gap(evaluations, tmp_path):
-    """A metric that a seed lacks, or all seeds at a speed, takes nothing away from the others."""
+    """A seed may lack a metric, or all seeds may lack it at a speed. The rest is still drawn."""
     for path, speeds in zip(evaluations, ((1, 2), (1,), (1, 2)), strict=True):
         content = json.loads(path.read_text())
         content["rows"] = [

@@ -1,4 +1,4 @@
-"""PPO against numbers worked out by hand, and on a problem whose optimum is known."""
+"""PPO against numbers worked out by hand, and on a problem with a known optimum."""
 
 import chex
 import jax
@@ -14,7 +14,7 @@ CONFIG = PPOConfig()
 
 
 class TestGAE:
-    """gamma 0.5, lambda 0.5 keep the arithmetic visible."""
+    """gamma and lambda are 0.5, so that the arithmetic is easy to follow."""
 
     def gae(self, reward, value, last, done, truncated):
         to = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
@@ -30,7 +30,7 @@ class TestGAE:
         np.testing.assert_allclose(target, [3.0625, 4.25, 7.0])
 
     def test_termination_cuts_value_and_trace(self):
-        # delta_1 = 2 - 4 = -2 (nothing behind it); delta_0 = 1 + 0.5*4 - 1 = 2
+        # delta_1 = 2 - 4 = -2 (no next value); delta_0 = 1 + 0.5*4 - 1 = 2
         # A_1 = -2; A_0 = 2 + 0.25*(-2) = 1.5
         advantage, _ = self.gae([1, 2, 3], [1, 4, 2], 8, [False, True, False], [False] * 3)
         np.testing.assert_allclose(advantage, [1.5, -2.0, 5.0])
@@ -42,7 +42,7 @@ class TestGAE:
         np.testing.assert_allclose(advantage, [2.0, 0.0, 5.0])
 
     def test_against_the_definition(self):
-        """A_t = sum_k (gamma lam)^k delta_{t+k} up to the episode's end, summed the slow way."""
+        """A_t = sum_k (gamma lam)^k delta_{t+k} up to the end of the episode, by two loops."""
         rng = np.random.default_rng(0)
         t, gamma, lam = 50, 0.994, 0.9
         reward, value, last = rng.normal(size=t), rng.normal(size=t), rng.normal()
@@ -75,7 +75,7 @@ class TestGaussian:
 
     def test_kl_by_hand_and_by_sampling(self):
         new = Gaussian(jnp.array([1.0, 1.0]), jnp.zeros(2))
-        # first: mean moved by 1 with s 1: 1/2; second: log(1/2) + 4/2 - 1/2
+        # first: the mean moves by 1 with s = 1: 1/2; second, old s 2, new s 1: log(1/2) + 4/2 - 1/2
         expected = 0.5 + np.log(0.5) + 1.5
         assert new.kl_from(self.OLD) == pytest.approx(expected)
         keys = jax.random.split(jax.random.key(0), 100_000)
@@ -101,7 +101,7 @@ def test_learning_rate_stays_in_bounds():
 
 
 def test_learning_rate_stays_below_its_ceiling():
-    """But not below the lower bound, and the ceiling itself not above the upper one."""
+    """The ceiling limits the rate, but never below the lower bound of the rate."""
     low, high = CONFIG.learning_rate_bounds
     slow = jnp.asarray(1e-9)
     assert ppo.adapt_learning_rate(CONFIG, jnp.asarray(high), slow, 1e-4) == pytest.approx(1e-4)
@@ -126,7 +126,7 @@ def samples(**changes):
 
 
 def bandit_apply(params, index):
-    """Policy and value that do not look at the observation."""
+    """Policy and value that do not depend on the observation."""
     mean = jnp.broadcast_to(params["mean"], (index.shape[0], 1))
     value = jnp.broadcast_to(params["value"], index.shape)
     return Gaussian(mean, params["log_std"]), value, jnp.zeros(index.shape)
@@ -182,7 +182,7 @@ def test_non_finite_gradient_changes_nothing_and_is_counted():
 
 
 def test_update_finds_the_best_action_of_a_bandit():
-    """Reward -(a - 2)^2: the mean moves from 0 to 2, the value to the reward's mean."""
+    """With the reward -(a - 2)^2 the mean moves from 0 to 2, and the value to the mean reward."""
     config = PPOConfig(learning_rate=1e-2, minibatches=4, epochs=4)
     learner = ppo.init(config, params())
 
@@ -227,7 +227,7 @@ def test_a_lowered_ceiling_rises_by_two_percent_an_update():
 
 
 def test_the_average_of_the_acting_parameters_by_hand():
-    """0.75 of the old and 0.25 of the new; 0: the newest. The critic is not averaged."""
+    """average 0.75: 0.75 old + 0.25 new. average 0: the newest. The critic is not averaged."""
     config = PPOConfig(average=0.75)
     old, new = {"log_std": jnp.asarray(1.0)}, {"log_std": jnp.asarray(2.0)}
     assert float(ppo.averaged(config, old, new)["log_std"]) == 1.25

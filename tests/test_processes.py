@@ -1,8 +1,8 @@
-"""Several processes of one training: what they tell each other, what the first one keeps, and what
-becomes of them all when one stops, fails or dies.
+"""Several processes of one training: their output, the files of the first one, and the end of all
+when one stops, fails or dies.
 
-The train step only counts, so that hardly anything is to be compiled; tests/test_devices.py has the
-real one. The processes run this file as a script.
+The train step here only counts, so that it compiles fast; tests/test_devices.py uses the real one.
+The processes run this file as a script.
 """
 
 import contextlib
@@ -30,7 +30,8 @@ SLOW = pytest.mark.slow(reason="starts Python four times")
 
 
 def filled(like):
-    """Numbers in an array of `like`'s shape, the first of them -0."""
+    """An array with the shape and type of `like`, full of numbers from 0 to -0.999. A scalar is 0,
+    and a random key is key 0."""
     if checkpoint_format.is_key(like):
         return jax.random.key(0)
     numbers = np.arange(like.size).reshape(like.shape) % 1000 / 1000
@@ -38,9 +39,10 @@ def filled(like):
 
 
 def counting(bad):
-    """In place of `devices.make`: a train step that counts and says that numbers are bad: where
-    `bad` is once, at the third step until the training goes back; where it is always, from there
-    on."""
+    """Replaces `devices.make` by a train step that only counts, and reports bad numbers.
+
+    bad: "never"; "once", from step 3 until the training goes back; "always", from step 3 on.
+    """
 
     def make(config, mesh):
         like = jax.eval_shape(lambda: train_step.init(config, 0))
@@ -65,7 +67,7 @@ def counting(bad):
 
 
 def count(bad, *args):
-    """`python -m kslc_jax.train` with that train step."""
+    """`python -m kslc_jax.train` with the train step of `counting`."""
     devices.make = counting(bad)
     sys.exit(train.main(list(args)))
 
@@ -90,7 +92,7 @@ def stored(run_dir):
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """Three train steps of two processes of two devices each, and what they said."""
+    """A training of three train steps by two processes with two devices each, and their output."""
     run_dir = tmp_path_factory.mktemp("two") / "r"
     with contextlib.ExitStack() as stack:
         children = started(stack, *COUNT, *DEBUG, *ON, 3 * BATCH, "--run-dir", run_dir)
@@ -111,8 +113,8 @@ def test_the_first_process_alone_writes_and_speaks(two):
 
 @SLOW
 def test_no_number_changes_with_the_number_of_devices(two, tmp_path):
-    """Two processes of two devices each, one of four, two of two: each goes on with what the one
-    before has saved, and saves the same bits."""
+    """Two processes with two devices each, then one with four, then two with two. Each training
+    resumes the checkpoint of the one before and saves the same bits."""
     run_dir = tmp_path / "r"
     shutil.copytree(two[0], run_dir)
     step, first = stored(run_dir)
@@ -167,7 +169,7 @@ def test_all_give_up_where_that_does_not_help(tmp_path):
 
 @SLOW
 def test_what_stops_the_first_process_stops_all(two):
-    """Here a run folder that is not to be overwritten."""
+    """Here the first process refuses to overwrite a run folder."""
     with contextlib.ExitStack() as stack:
         started_again = started(stack, *COUNT, *DEBUG, *ON, BATCH, "--run-dir", two[0])
         (_, first), (_, second) = ended(started_again, code=2)
@@ -178,7 +180,7 @@ def test_what_stops_the_first_process_stops_all(two):
 @SLOW
 @pytest.mark.parametrize("lost", [0, 1])
 def test_the_death_of_one_process_ends_the_other(tmp_path, lost):
-    """And the run folder is free and whole."""
+    """Afterwards the run folder is unlocked, and its checkpoint is readable."""
     run_dir = tmp_path / "r"
     with contextlib.ExitStack() as stack:
         children = started(stack, *COUNT, *DEBUG, "--steps", 10**7, "--run-dir", run_dir)

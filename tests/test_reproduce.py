@@ -1,4 +1,4 @@
-"""Published numbers against new ones: bands, milestones, and what is said where there are none."""
+"""Published numbers against new ones: bands, milestones, and the errors without stored numbers."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from kslc_jax.training.recovery import NumbersError
 
 @pytest.fixture
 def shipped(tmp_path, monkeypatch):
-    """A policy that asks for the default pose, among the shipped ones; it falls at once."""
+    """A shipped policy that always commands the default pose. It falls soon."""
     config = preset("debug")
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
     policy = policy_lib.Policy(config, params, curriculum.init(config), 7)
@@ -36,7 +36,7 @@ def test_bands():
     new = [{"command": 1.0, "survival": 1.0, "forward_mean": 0.92, "cost_of_transport": 9.0}]
     assert reproduce.compare_rows(old, new) == [
         ("survival at 1 m/s", 1.0, 1.0, True),
-        ("forward_mean at 1 m/s", 0.98, 0.92, False),  # 0.06 off, 0.05 allowed; CoT has no band
+        ("forward_mean at 1 m/s", 0.98, 0.92, False),  # 0.06 off; the band is 0.05. CoT has none
     ]
     missing = reproduce.compare_rows(old, [{"command": 1.0, "survival": 0.0}])
     assert not any(agrees for *_, agrees in missing)
@@ -83,7 +83,7 @@ def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def trained(shipped, monkeypatch):
-    """What a training of `shipped` does: begins with train step 1, and ends as told."""
+    """A fake training of `shipped`. `outcome` sets the share of its steps and its error."""
     (shipped / files.EVALUATION).write_text(evaluation(0.0))
     (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
     outcome = {"steps": 1.0, "raises": None}

@@ -1,4 +1,4 @@
-"""The tables of docs/results.md and docs/lab_notebook.md say what the stored data say."""
+"""The tables of docs/results.md and docs/lab_notebook.md agree with the stored data."""
 
 import itertools
 import json
@@ -25,11 +25,11 @@ FORMS = {
     "within speed limits": ("within_speed_limits", "{:.1%}"),
     "cost of transport": ("cost_of_transport", "{:.2f}"),
 }
-"""Columns of the document: metric and how it is written; command 0 has no cost of transport."""
+"""Column headings of the documents, with metric and format. Command 0 has no cost of transport."""
 
 
 def table(section: str) -> list[list[str]]:
-    """Cells of a section's first table, its header first; the section is in one of the pages."""
+    """Cells of the first table in a section, header first. Exactly one page has the section."""
     (text,) = (
         part.partition("\n## ")[0]
         for page in PAGES
@@ -41,7 +41,8 @@ def table(section: str) -> list[list[str]]:
 
 
 def assert_column_per_command(head, rows, stored, forms):
-    """A table whose rows are metrics; what a label says before a colon is of the conditions."""
+    """The table has a row per metric and a column per command. Labels may start with a condition
+    and a colon."""
     assert [float(command) for command in head[1:]] == [n["command"] for n in stored]
     for label, *cells in rows:
         name, form = forms[label.split(": ")[-1]]
@@ -102,7 +103,7 @@ def test_compare():
 
 
 def test_what_to_expect():
-    """README's table, the policy's milestones and the stored training are one."""
+    """README's table and the policy's milestones agree with the stored training."""
     records = plots.read_metrics(DOCS / "training" / "laptop-seed0.jsonl")
     reached = plots.milestones(records)
     policy = json.loads((POLICIES / "xbot_l_run" / "milestones.json").read_text())

@@ -1,4 +1,5 @@
-"""Every reward term against numbers worked out by hand, and the readings of unclear equations."""
+"""Every reward term against numbers worked out by hand. Unclear equations of the paper are tested
+as printed and as this package reads them."""
 
 import dataclasses
 import functools
@@ -58,7 +59,10 @@ def names(cls: type) -> set[str]:
 
 
 def make_inputs(**changes: Any) -> rewards.Inputs:
-    """A robot standing at rest under a zero command; `vx`, and any field of any part, by name."""
+    """Inputs of a robot that stands at rest under a zero command, with named changes.
+
+    `vx` is the commanded forward speed. Other names are fields of signals, gait, command or Inputs.
+    """
     if "vx" in changes:
         changes["velocity"] = [changes.pop("vx"), 0.0, 0.0]
 
@@ -109,7 +113,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     # g = 0.5: target 0.89 (1 - 0.05 / 2) = 0.86775, error 0.01; backwards the same.
     ("base_height", KSLC, {"vx": 1.75, "base_pos": [0, 0, 0.87775]}, 0.36787944),
     ("base_height", KSLC, {"vx": -1.75, "base_pos": [0, 0, 0.87775]}, 0.36787944),
-    # g is relative to the curriculum: 1 / 2.
+    # g is |vx| divided by v_max: 1 / 2.
     ("base_height", KSLC, {"vx": 1.0, "v_max": 2.0, "base_pos": [0, 0, 0.85775]}, 0.36787944),
     # g at most 1: target 0.8455.
     ("base_height", KSLC, {"vx": 5.0, "base_pos": [0, 0, 0.8455]}, 1.0),
@@ -117,7 +121,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("base_height", LOOSE, {"base_pos": [0, 0, 0.79]}, 0.04978707),
     # Fixed target: error 0.01225, e^-1.225.
     ("base_height", HG, {"vx": 1.75, "base_pos": [0, 0, 0.87775]}, 0.29375770),
-    # In flight the floor counts, wherever the feet are.
+    # In flight the height is measured from the floor; the feet do not matter.
     (
         "base_height",
         HG,
@@ -158,8 +162,8 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("feet_clearance", KSLC, {"swing_height": [1.0, 0], "stance": [False, True]}, 0.0),
     # Width 0.03, error 0.03.
     ("feet_clearance", LOOSE, {"swing_height": [0.09, 0], "stance": [False, True]}, 0.36787944),
-    # Mid-swing, sin = -1: 2 x 1; a twelfth of a cycle after touchdown of the other foot, sin = 0.5:
-    # 2 x 0.25; at lift-off nothing.
+    # At mid-swing sin = -1: 2 x 1. A twelfth of a cycle after touchdown of the other foot sin =
+    # 0.5: 2 x 0.25. At lift-off sin = 0: 0.
     (
         "feet_clearance",
         MID_SWING,
@@ -205,7 +209,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         {"joint_pos": joints(left_knee=0.5), "joint_vel": np.full(16, 9.0)},
         0.26787944,
     ),
-    # KSLC at rest is HG's. At the speed limit (legs 12, arms 7 rad/s) the error counts e^-1:
+    # KSLC at rest equals HG. At the speed limit (legs 12, arms 7 rad/s) the error counts e^-1:
     # n = 0.5 * 0.367879 = 0.183940; e^(-2 n) - 0.2 n = 0.692201 - 0.036788.
     ("joint_pos", KSLC, {"joint_pos": joints(left_knee=0.3, right_knee=0.4)}, 0.26787944),
     (
@@ -220,7 +224,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         {"joint_pos": joints(left_elbow_pitch=0.5), "joint_vel": joints(left_elbow_pitch=7.0)},
         0.65541268,
     ),
-    (  # another joint's speed does not matter
+    (  # the speed of another joint does not matter
         "joint_pos",
         KSLC,
         {"joint_pos": joints(left_knee=0.5), "joint_vel": joints(right_knee=12.0)},
@@ -257,14 +261,14 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("low_speed", KSLC, {"vx": -0.3, "base_linvel": [-0.1, 0, 0]}, -1.0),
     ("low_speed", KSLC, {"vx": 0.05, "base_linvel": [-1.0, 0, 0]}, 0.0),
     ("low_speed", KSLC, {"velocity": [0.0, 0.3, 0.0], "base_linvel": [1.0, 0, 0]}, 0.0),
-    # The mean velocity counts, not the present one: |(0.06, -0.08)| = 0.1: e^-1.
+    # The mean velocity counts, not the present one. The error is |(0.06, -0.08)| = 0.1: e^-1.
     (
         "tracking_mean_vel",
         KSLC,
         {"velocity": [1.0, 0, 0.5], "mean_velocity": [1.06, -0.08], "base_linvel": [9, 9, 9]},
         0.36787944,
     ),
-    # Half way from 0.5 to 2.5 m/s: half; nothing at the start of the curriculum.
+    # v_max half way from 0.5 to 2.5 m/s: 0.5. At the start of the curriculum: 0.
     ("tracking_mean_vel", KSLC, {"v_max": 1.5}, 0.5),
     ("tracking_mean_vel", KSLC, {"v_max": 0.5}, 0.0),
     # e_xy = 0.5, e_yaw = 0.2: (e^-5 + e^-2) / 2 - 0.2 * 0.7 = 0.0710366 - 0.14.
@@ -284,7 +288,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("feet_contact_number", KSLC, {"stance": [True, False], "foot_contact": [False, True]}, -0.3),
     ("feet_air_time", KSLC, {"landing": [0.3, 0.0]}, 0.3),
     ("feet_air_time", KSLC, {"landing": [0.7, 0.2]}, 0.7),  # 0.5 + 0.2
-    # sqrt(0.5) for the foot in contact; sqrt(1) more for the other.
+    # sqrt(0.5) for the left foot; with the right foot in contact too, sqrt(1) more.
     (
         "foot_slip",
         KSLC,
@@ -294,15 +298,15 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("foot_slip", KSLC, {"foot_vel": [[0.3, 0.4, 5.0], [0.6, 0.8, 0.0]]}, 1.70710678),
     ("feet_contact_forces", KSLC, {"foot_force": [900.0, 650.0]}, 200.0),
     ("feet_contact_forces", KSLC, {"foot_force": [1200.0, 701.0]}, 401.0),
-    # 0.05 too near or too far: (e^-5 + 1) / 2. Height does not count.
+    # 0.05 too close or too far: (e^-5 + 1) / 2. Height does not count.
     ("feet_distance", KSLC, {}, 1.0),
     ("feet_distance", KSLC, {"foot_pos": [[0, 0.1, 0.05], [0, -0.05, 0.05]]}, 0.50336897),
     ("feet_distance", KSLC, {"foot_pos": [[0, 0.3, 0.05], [0, -0.25, 0.05]]}, 0.50336897),
     ("feet_distance", KSLC, {"foot_pos": [[0.3, 0.2, 0.05], [0, -0.2, 0.4]]}, 1.0),
-    # 0.6 ahead and 0.3 aside: in the plane 0.6708, (1 + e^-17.08) / 2; lateral 0.3.
+    # 0.6 ahead and 0.3 sideways: 0.6708 in the plane, (1 + e^-17.08) / 2; 0.3 lateral, 1.
     ("feet_distance", KSLC, {"foot_pos": [[0.6, 0.15, 0.05], [0, -0.15, 0.05]]}, 0.50000002),
     ("feet_distance", LATERAL, {"foot_pos": [[0.6, 0.15, 0.05], [0, -0.15, 0.05]]}, 1.0),
-    # Heading +y: aside is x.
+    # Heading +y: sideways is the x axis.
     (
         "feet_distance",
         LATERAL,
@@ -315,7 +319,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         {"foot_pos": [[-0.15, 0.6, 0.05], [0, 0, 0.05]], "base_euler": [0, 0, np.pi / 2]},
         0.50336897,
     ),
-    # Heading 45 degrees to the left: aside is (-1, 1) / sqrt 2.
+    # Heading 45 degrees to the left: sideways is (-1, 1) / sqrt 2.
     (
         "feet_distance",
         LATERAL,
@@ -355,7 +359,8 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         {"base_euler": [0.03, -0.07, 2.0], "gravity": [0.03, 0.04, -0.998749]},
         0.36787944,
     ),
-    # Leaning forward by 0.2: (e^-2 + e^(-20 sin 0.2)) / 2; free at 2 m/s if 0.1 rad per m/s.
+    # A forward lean of 0.2 rad: (e^-2 + e^(-20 sin 0.2)) / 2. With 0.1 rad per m/s allowed, it is
+    # free at 2 m/s.
     (
         "orientation",
         KSLC,
@@ -377,7 +382,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ),
     ("collision", KSLC, {}, 0.0),
     ("collision", KSLC, {"torso_contact": True}, 1.0),
-    # 0.5 + 0.1 * 2; with what is restless, 0.5 * (0.6^2 + 0.8^2), on top, half way half of it.
+    # 0.5 + 0.1 * 2. `restless` adds 0.5 * (0.6^2 + 0.8^2), and half of that at v_max 1.5.
     *(
         (
             "stand_still",
@@ -403,7 +408,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         },
         0.0,
     ),
-    # 1 <- 0.5 <- 0.2: 0.5^2 + (1 + 0.2 - 1)^2 + 0.05; a constant -2: 0.05 * 2.
+    # Actions 0.2, 0.5, 1: 0.5^2 + (1 + 0.2 - 1)^2 + 0.05 * 1. Constant -2: 0.05 * 2.
     (
         "action_smoothness",
         KSLC,
@@ -426,7 +431,8 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         },
         500.0,
     ),
-    # Shares of the limit over 0.9: 12/12, -11.4/12 and 7.7/7; half the limit; 30/12, at most 1.
+    # Sum of the shares above 0.9 of the limit, each at most 1. First 12/12, 11.4/12 and 7.7/7: 0.1
+    # + 0.05 + 0.2; then half the limit: 0; then 30/12: 1.
     (
         "dof_vel_limits",
         KSLC,
@@ -464,7 +470,7 @@ def test_terms_and_weights_are_one_to_one():
 
 @pytest.mark.parametrize("name", ["paper", "baseline", "baseline-laptop"])
 def test_weights_are_humanoid_gyms(name):
-    """The paper adds angular momentum; all other terms that are not in HG's table are off."""
+    """The paper adds angular momentum. All other terms that HG's table lacks are off."""
     weights = dataclasses.asdict(preset(name).rewards.weights)
     assert {k: weights.pop(k) for k in HUMANOID_GYM} == HUMANOID_GYM
     assert weights.pop("angular_momentum") == (0.05 if name == "paper" else 0.0)
@@ -477,7 +483,7 @@ def only(**weights: float) -> RewardConfig:
 
 
 def test_reward_is_the_weighted_sum_times_dt():
-    """0.01 (1.2 * 1 - 1e-5 * 100^2 - 1 * 1): perfect tracking, one torque of 100 N m, a fall."""
+    """0.01 (1.2 * 1 - 1e-5 * 100^2 - 1 * 1): perfect tracking, a torque of 100 N m, and a fall."""
     cfg = only(tracking_lin_vel=1.2, torques=-1e-5, collision=-1.0)
     x = make_inputs(torque=joints(left_knee=100.0), torso_contact=True)
     reward, raw = rewards.evaluate(cfg, robot.load(), 0.01, x)
@@ -519,7 +525,7 @@ def test_total_is_the_table_applied_to_the_raw_terms(cfg):
 
 
 def test_equation_2_and_table_1_sign_of_the_momentum_factor():
-    """Printed: 0.05 in the text, -0.05 in Table I. A penalty needs the positive one."""
+    """Printed: 0.05 in the text, -0.05 in Table I. Only the positive factor gives a penalty."""
     momenta = [0.0, 3.0, 5.0, 10.0]
     paid = [
         0.05 * value(KSLC, "angular_momentum", make_inputs(angular_momentum=[0, 0, m]))
@@ -528,17 +534,17 @@ def test_equation_2_and_table_1_sign_of_the_momentum_factor():
     np.testing.assert_allclose(paid, [0.0, -0.0411059, -0.0859141, -0.3194528], atol=1e-6)
     assert KSLC.weights.angular_momentum == 0.05
     literal = [-np.exp(m) for m in momenta]
-    assert np.all(np.diff(-0.05 * np.array(literal)) > 0)  # Table I's sign: more momentum, more pay
+    assert np.all(np.diff(-0.05 * np.array(literal)) > 0)  # Table I rewards more momentum
 
 
 def test_equation_4_as_printed_and_as_read():
-    """Printed: clip(-exp(|L|), c1, c2), c1 and c2 not given."""
+    """Printed: clip(-exp(|L|), c1, c2). The paper does not give c1 and c2."""
     momenta = np.array([0.0, 1.0, 5.0, 15.0])
     literal = -np.exp(momenta)
     np.testing.assert_allclose(literal, [-1.0, -2.7182818, -148.41316, -3269017.4], rtol=1e-6)
     assert np.all(
         literal <= -1.0
-    )  # a robot at rest is fined, and 15 kg m^2/s a million times as much
+    )  # the penalty is 1 at rest, and 3 million at an angular momentum of 15 kg m^2/s
     ours = [
         value(KSLC, "angular_momentum", make_inputs(angular_momentum=[m, 0, 0])) for m in momenta
     ]
@@ -558,12 +564,12 @@ def test_equation_4_floor_is_reached_at_5_ln_21():
     [
         (3.5, 0.89, 1.9e-37, 0.0116796),  # e^-84.55; e^(-100 * 0.0445)
         (3.5, 0.8455, 1.6e-35, 1.0),  # e^-80.1; on target
-        (3.5, 0.0445, 1.0, 1.6e-35),  # what the printed form asks for: 4.45 cm above the ground
+        (3.5, 0.0445, 1.0, 1.6e-35),  # the printed form wants the base 4.45 cm above the ground
         (0.0, 0.89, 2.2e-39, 1.0),  # e^-89: target 0
     ],
 )
 def test_equation_6_as_printed_and_as_read(speed, height, printed, read):
-    """Printed: exp(-100 |h - 0.05 * 0.89 g|): the target is at most 4.45 cm."""
+    """Printed: exp(-100 |h - 0.05 * 0.89 g|). Its target is at most 4.45 cm."""
     literal = np.exp(-100.0 * abs(height - 0.05 * 0.89 * speed / 3.5))
     assert literal == pytest.approx(printed, rel=0.05)
     ours = value(KSLC, "base_height", make_inputs(vx=speed, base_pos=[0, 0, height]))
@@ -575,13 +581,13 @@ def test_equation_6_as_printed_and_as_read(speed, height, printed, read):
     [
         (3.5, 0.12, 0.06, 1.0),
         (3.5, 0.06, 0.0, 0.0024788),  # e^-6
-        (3.5, 1.0, 0.94, 0.0),  # a kick is worth more than any clearance
+        (3.5, 1.0, 0.94, 0.0),  # printed: a very high kick earns the most
         (0.0, 0.06, 0.06, 1.0),
         (0.0, 1.0, 1.0, 0.0),
     ],
 )
 def test_equation_7_as_printed_and_as_read(speed, height, printed, read):
-    """Printed: xi (h - 0.06 g): linear in the height, without bound."""
+    """Printed: xi (h - 0.06 g). It is linear in the height, without an upper bound."""
     assert height - 0.06 * speed / 3.5 == pytest.approx(printed, abs=1e-9)
     x = make_inputs(vx=speed, swing_height=[height, 0.0], stance=[False, True])
     assert value(KSLC, "feet_clearance", x) == pytest.approx(read, rel=1e-3, abs=1e-9)
@@ -599,12 +605,12 @@ def literal_equation_8(error: np.ndarray, speed: np.ndarray) -> float:
         (0.01, -12.0, -0.1, 0.9919338),
         # 1 * e^-12 = 6.1e-6; ours: n = e^-1: e^-0.735759 - 0.2 * 0.367879
         (1.0, 12.0, 0.9999865, 0.4055656),
-        # Not moving: both e^-1 - 0.1.
+        # At rest both give e^-1 - 0.1.
         (0.5, 0.0, 0.2678794, 0.2678794),
     ],
 )
 def test_equation_8_as_printed_and_as_read(error, speed, printed, read):
-    """Printed: each error times exp(-joint velocity), in rad/s and with its sign."""
+    """Printed: each error times exp(-joint velocity). The velocity is in rad/s and has a sign."""
     q, dq = joints(left_knee=error), joints(left_knee=speed)
     assert literal_equation_8(q, dq) == pytest.approx(printed, rel=1e-5)
     assert value(KSLC, "joint_pos", make_inputs(joint_pos=q, joint_vel=dq)) == pytest.approx(
@@ -613,9 +619,9 @@ def test_equation_8_as_printed_and_as_read(error, speed, printed, read):
 
 
 def test_equation_8_pays_both_sides_alike_only_as_read():
-    """This robot's mirrored joints move with opposite signs.
-
-    Printed: n = |0.3 e^4, 0.1 e^-2| = 16.4 on one side, |0.3 e^-4, 0.1 e^2| = 0.7389 on the other.
+    """The mirrored joints of this robot move with opposite signs, so the printed form treats the
+    sides differently: n = |0.3 e^4, 0.1 e^-2| = 16.4 on one side, |0.3 e^-4, 0.1 e^2| = 0.7389 on
+    the other.
     """
     permutation, sign = robot.mirror_joints()
     q, dq = joints(left_knee=-0.3, left_leg_pitch=-0.1), joints(left_knee=-4.0, left_leg_pitch=2.0)
@@ -629,14 +635,15 @@ def test_equation_8_pays_both_sides_alike_only_as_read():
 
 
 def test_learning_rate_as_printed_and_as_read():
-    """Table I: 1e-5. Constant, Adam could move a weight by 0.24 in 3001 updates of 8 steps."""
+    """Printed in Table I: 1e-5. With it as a constant, Adam could move a weight by only 0.24 in
+    3001 updates of 8 steps. Read: it is the start of an adaptive rate."""
     config = PPOConfig()
     gradient_steps = 3001 * config.minibatches * config.epochs
     assert gradient_steps == 24_008
     assert gradient_steps * 1e-5 == pytest.approx(0.24, rel=1e-3)
     rate, climb = jnp.asarray(config.learning_rate), []
     assert float(rate) == pytest.approx(1e-5)
-    for _ in range(20):  # a KL of 0.001 is below half of 0.01: x 1.5 each
+    for _ in range(20):  # a KL of 0.001 is below half of 0.01: each time x 1.5
         rate = ppo.adapt_learning_rate(config, rate, jnp.asarray(0.001))
         climb.append(float(rate))
     assert climb[0] == pytest.approx(1.5e-5, rel=1e-5)

@@ -1,4 +1,4 @@
-"""The robot's file against an independent calculation from the URDF's numbers."""
+"""The robot's model file against an independent calculation from the numbers of the URDF."""
 
 import functools
 import json
@@ -19,7 +19,7 @@ NOMINAL = jax.tree.map(np.asarray, randomize.nominal())
 
 
 def rotation(rpy):
-    """Fixed-axis x-y-z."""
+    """Rotation matrix of URDF angles: about fixed axes x, y, z."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
     x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -28,14 +28,14 @@ def rotation(rpy):
 
 
 def about(axis, angle):
-    """Rodrigues."""
+    """Rotation matrix about an axis, by Rodrigues' formula."""
     k = np.cross(np.eye(3), np.asarray(axis) / np.linalg.norm(axis))
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
 def forward(q):
-    """World (R, p) of every URDF link with the base at the origin, and per-joint (axis, anchor,
-    links moved). Runs over the URDF's own frames, all 90 joints."""
+    """World (R, p) of every URDF link with the base at the origin, and per joint (axis, anchor,
+    child link). It goes through the frames of all 90 URDF joints."""
     pose = {"base_link": (np.eye(3), np.zeros(3))}
     angle = dict(zip(ORDER, q, strict=True))
     joints = {}
@@ -61,7 +61,7 @@ def moves(joint_link, link):
 
 
 def inertia_matrix(q):
-    """Joint-space inertia [22, 22]: sum over URDF links of J^T M J, base twist first."""
+    """Joint-space inertia [22, 22]: the sum over URDF links of J^T M J; the base twist is first."""
     pose, joints = forward(q)
     total = np.zeros((22, 22))
     for link, row in URDF.items():
@@ -120,13 +120,14 @@ def test_joint_space_inertia_within_a_tenth_of_a_percent(xbot, poses):
         mujoco.mj_fullM(xbot.mj_model, data, full)
         full -= np.diag(xbot.mj_model.dof_armature)  # rotor inertia, not in the URDF
         expected = inertia_matrix(q)
-        # Each entry against the two inertias that it couples, so that small ones count as well.
+        # The error of each entry is relative to the two inertias that it couples, so small ones
+        # count too.
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
         assert np.abs((full - expected) / scale).max() < 1e-3
 
 
 def test_every_frame_is_the_bases_at_the_zero_pose(xbot, poses):
-    """Our rotations are the URDF's, measured from its zero pose."""
+    """Our rotations equal the URDF's rotations relative to its zero pose."""
     zero, _ = forward(np.zeros(16))
     for q in poses:
         data, (expected, _) = at_origin(xbot.mj_model, q), forward(q)
@@ -150,7 +151,7 @@ def test_limits_gains_and_motors(xbot):
 
 
 def test_the_engine_itself_limits_no_torque(xbot):
-    """motors.motor_torque does; the servos are plain kp (ctrl - q) - kd dq."""
+    """`motors.motor_torque` limits it. The servos are plain kp (ctrl - q) - damping dq."""
     m = xbot.mj_model
     np.testing.assert_array_equal(m.actuator_biasprm[:, 1], -xbot.kp)
     np.testing.assert_array_equal(m.actuator_gear[:, 0], 1)
@@ -175,7 +176,8 @@ def test_sensors_by_name(fidelity):
 
 
 def test_sensors_read_what_their_names_say(xbot, poses):
-    """Against the URDF's links, in any base pose; speeds from central differences of theirs."""
+    """Sensors against the links of the URDF, in random base poses. Expected speeds come from
+    central differences of link positions."""
     model, rng, h = xbot.mj_model, np.random.default_rng(4), 1e-5
 
     def links(qpos):
@@ -218,7 +220,7 @@ def test_sensors_read_what_their_names_say(xbot, poses):
 
 
 def test_angular_momentum_is_eq_3(xbot):
-    """L = sum c_i x m_i cdot_i + I_i w_i about the whole-body CoM equals the sensor to 1e-4."""
+    """The sensor equals L = sum c_i x m_i cdot_i + I_i w_i about the whole-body CoM to 1e-4."""
     model = xbot.mj_model
     rng = np.random.default_rng(1)
     data = mujoco.MjData(model)
@@ -234,7 +236,7 @@ def test_angular_momentum_is_eq_3(xbot):
         for i in range(model.nbody):
             mujoco.mj_objectVelocity(
                 model, data, mujoco.mjtObj.mjOBJ_BODY, i, velocity[i], 0
-            )  # rotation, then translation of the body's own CoM, world axes
+            )  # angular, then linear velocity of the body's own CoM, world axes
         com = mass @ data.xipos[1:] / mass.sum()
         com_velocity = mass @ velocity[1:, 3:] / mass.sum()
         total = np.zeros(3)
@@ -259,9 +261,10 @@ def test_only_soles_can_meet_the_floor_in_training(xbot):
 
 @pytest.mark.parametrize("fidelity", ["train", "high"])
 def test_soles_are_where_the_feet_end(fidelity):
-    """0.8853 m below the base; four contacts a foot, spread over the mesh's footprint, not beyond.
+    """The soles are 0.8853 m below the base. Each foot has four contacts, spread over the footprint
+    of its mesh but not beyond.
 
-    Friction is the foot's (priority): randomize sets that one.
+    The contacts have the friction of the foot (geom priority), which `randomize` sets.
     """
     r = robot.load(fidelity)
     data = mujoco.MjData(r.mj_model)
@@ -311,7 +314,7 @@ def test_high_fidelity_options():
     assert m.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert m.opt.iterations >= 100
     assert m.opt.tolerance <= 1e-10 and m.opt.ls_iterations >= 50
-    leg = [0.01, 0.01, 0.01, 0.01, 0.05, 0.05]  # the public MJCF's ankles rub more
+    leg = [0.01, 0.01, 0.01, 0.01, 0.05, 0.05]  # the ankles of the public MJCF have more
     np.testing.assert_allclose(m.dof_frictionloss[6:], [*leg, *leg, 1, 1, 1, 1])
     np.testing.assert_allclose(m.dof_damping[6:], [0.01] * 12 + [1.0] * 4)
     np.testing.assert_allclose(m.dof_armature[6:], 0.01)
@@ -336,7 +339,7 @@ def in_the_air(fidelity):
 
 
 def parts_that_touch(q, fidelity):
-    """Pairs of bodies, by number."""
+    """Pairs of body ids that are in contact."""
     model, data = in_the_air(fidelity)
     data.qpos[7:] = q
     mujoco.mj_kinematics(model, data)
@@ -347,8 +350,8 @@ def parts_that_touch(q, fidelity):
 
 @pytest.mark.parametrize("spread", [0.2, 0.5, None], ids=["gaits", "wide", "limits"])
 def test_what_touches_at_high_fidelity_touches_in_training(xbot, spread):
-    """Random poses around home, and anywhere within the joint limits. A policy finds whatever may
-    pass through whatever."""
+    """Random poses around the home pose, and anywhere within the joint limits. A policy would learn
+    to pass one part through another if training allowed it."""
     rng = np.random.default_rng(7)
     low, high, touched = xbot.joint_lower, xbot.joint_upper, set()
     for _ in range(2000):
@@ -361,7 +364,7 @@ def test_what_touches_at_high_fidelity_touches_in_training(xbot, spread):
 
 
 def test_parts_are_kept_apart_a_little_before_they_touch():
-    """Legs that close like scissors meet in training first, by the margin and no more."""
+    """The legs close like scissors. In training they touch earlier, by at most the margins."""
     closed, first = np.zeros(16), {}
     for roll in np.linspace(0.0, 0.3, 301):
         closed[[0, 6]] = -roll, roll
@@ -373,7 +376,8 @@ def test_parts_are_kept_apart_a_little_before_they_touch():
 
 
 def test_stand_ins_cover_their_parts():
-    """The corners of the feet's boxes with the pairs' margin, and the hand's ellipsoid."""
+    """The foot's capsule plus the pair margin covers the corners of the foot's box; the forearm's
+    capsule covers the ellipsoid of the hand."""
     for side in ("left", "right"):
         bumper, box = train(f"{side}_foot_bumper"), train(f"{side}_foot")
         np.testing.assert_allclose(bumper.pos, box.pos)
@@ -398,7 +402,7 @@ def test_stand_ins_are_gone_at_high_fidelity():
 def test_high_fidelity_self_collision(xbot):
     assert not contacts(np.zeros(16))
     rng = np.random.default_rng(2)
-    for _ in range(50):  # one leg alone never touches itself
+    for _ in range(50):  # legs in the same pitch pose touch nothing
         q = np.zeros(16)
         q[2:5] = rng.uniform([-1.2, -0.9, -0.6], [0.6, 0.6, 0.6])
         q[8:11] = -q[2:5]
@@ -413,7 +417,7 @@ def test_high_fidelity_self_collision(xbot):
 
 @pytest.mark.parametrize(("first", "sign"), [(0, 1), (6, -1)])
 def test_a_walking_leg_touches_nothing_but_perhaps_a_hand(first, sign):
-    """All six joints of one leg, hip roll and yaw included."""
+    """Random poses of all six joints of one leg."""
     rng = np.random.default_rng(5)
     low = np.array([-0.1, -0.3, -1.2, -1.0, -0.6, -0.3])
     high = np.array([0.4, 0.3, 0.7, 1.0, 0.6, 0.3])
@@ -457,7 +461,8 @@ def test_high_fidelity_floor_meets_all_parts():
 
 @pytest.mark.parametrize("fidelity", ["train", "high"])
 def test_stands_on_its_feet(fidelity):
-    """Servos at zero for 0.3 s: still upright; the soles' impulse is the momentum gained."""
+    """Servos hold the zero pose for 0.3 s. The robot stays upright, and the impulse of the soles
+    equals gravity's impulse plus the change of momentum."""
     r = robot.load(fidelity)
     data = mujoco.MjData(r.mj_model)
     data.qpos[:] = r.default_qpos
@@ -477,7 +482,7 @@ def test_stands_on_its_feet(fidelity):
 
 
 def test_mirrored_joints_give_the_mirrored_robot(xbot):
-    """Bodies land at (x, -y, z) of their partners, within the URDF's own left-right differences."""
+    """Each body is at (x, -y, z) of its partner, up to the left-right differences in the URDF."""
     permutation, sign = robot.mirror_joints()
     q = np.random.default_rng(3).uniform(-0.4, 0.4, 16)
     np.testing.assert_allclose((q[permutation] * sign)[permutation] * sign, q)
@@ -492,7 +497,7 @@ def test_mirrored_joints_give_the_mirrored_robot(xbot):
 
 
 def test_mirrored_motion_is_the_mirror_image(xbot, poses):
-    """Velocities negate y, angular velocities x and z; the joint limits mirror too."""
+    """The mirror negates y of velocities, x and z of angular velocities, and swaps joint limits."""
     permutation, sign = robot.mirror_joints()
     np.testing.assert_array_equal(sign * xbot.joint_upper[permutation], xbot.joint_lower)
     m, rates = xbot.mj_model, np.random.default_rng(6).normal(size=(len(poses), 16))

@@ -1,4 +1,4 @@
-"""Run folders as a person meets them: train, stop, resume, load, and what goes wrong."""
+"""Run folders from the user's side: train, stop, resume, load, and errors."""
 
 import contextlib
 import ctypes.util
@@ -34,7 +34,8 @@ DEBUG = ["--preset", "debug"]
 
 
 def cli(*args):
-    """What `python -m kslc_jax.train` prints, run in this process: it compiles once."""
+    """The output of `python -m kslc_jax.train`. It runs in this process, so that the compiled
+    program is reused."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
         assert train.main([str(a) for a in args]) == 0
@@ -42,7 +43,7 @@ def cli(*args):
 
 
 def records(run_dir: Path):
-    """metrics.jsonl without wall-clock fields."""
+    """The records of metrics.jsonl without `seconds`."""
     rows = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
     return [{k: v for k, v in r.items() if not k.startswith("seconds")} for r in rows]
 
@@ -99,7 +100,7 @@ def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
     cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1024)
     assert numbers(records(tmp_path / "r")) == numbers(records(run_dir))
     rows = map(json.loads, (tmp_path / "r" / "metrics.jsonl").read_text().splitlines())
-    assert np.all(np.diff([row["seconds"] for row in rows]) > 0.0)  # the clock goes on, too
+    assert np.all(np.diff([row["seconds"] for row in rows]) > 0.0)  # the clock goes on after resume
     a, b = restored(run_dir), restored(tmp_path / "r")
     for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
         if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
@@ -108,7 +109,8 @@ def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
 
 
 def test_profile_changes_no_number(whole, tmp_path):
-    """Two train steps are traced, from the second on; a run that ends before writes what it has."""
+    """A profile has two train steps, from the second step on. If the run ends early, the profile
+    has the steps so far."""
     run_dir = tmp_path / "r"
     out = cli(*DEBUG, "--run-dir", run_dir, "--profile", 2)
     assert f"profile of 2 train steps in {run_dir / 'profile'}" in out and "perfetto" in out
@@ -135,7 +137,7 @@ def wait_for(path: Path, lines: int, process):
 
 @pytest.fixture(scope="module")
 def unkilled(tmp_path_factory):
-    """Records of a long run that nobody disturbed."""
+    """Records of a long run without interruption."""
     run_dir = tmp_path_factory.mktemp("runs") / "unkilled"
     cli(*DEBUG, "--run-dir", run_dir, "--steps", 200 * 128)
     return numbers(records(run_dir))
@@ -149,7 +151,8 @@ def unkilled(tmp_path_factory):
     ],
 )
 def test_killed_run_resumes_with_the_same_numbers(sig, unkilled, tmp_path):
-    """Killed in mid-run: what follows from the last checkpoint equals the unkilled run."""
+    """A run is killed and resumed from its last checkpoint. Its numbers equal the run without a
+    kill."""
     run_dir = tmp_path / "r"
     args = [*DEBUG, "--run-dir", str(run_dir), "--steps", "1000000"]
     args += ["--run.checkpoint-minutes", "0.005"]
@@ -176,7 +179,7 @@ def test_first_signal_asks_second_interrupts():
     with loop._Stop() as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop.requested == "SIGINT"
-        signal.raise_signal(signal.SIGTERM)  # the same wish, come by another way
+        signal.raise_signal(signal.SIGTERM)  # soon after the first: counts as the same request
         assert stop.requested == "SIGINT"
         stop._since -= loop.SAME_SIGNAL_SECONDS
         with pytest.raises(KeyboardInterrupt):
@@ -184,7 +187,8 @@ def test_first_signal_asks_second_interrupts():
 
 
 def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
-    """With its networks and as far as it had got, but a new optimiser; other networks: one line."""
+    """A training takes the networks and the curriculum of a policy, and starts at step 0. A policy
+    with other network shapes gives a one-line error."""
     run_dir = tmp_path / "r"
     old = kslc_jax.load_policy(whole[0])
     old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
@@ -232,7 +236,7 @@ def test_load_policy(whole):
 
 @pytest.mark.slow(reason="compiles trials of the policies, half a minute")
 def test_policies_are_kept_on_the_way(whole, tmp_path, capsys):
-    """Each loads as a policy; what they can do is written beside them."""
+    """Each snapshot loads as a policy. `learning` writes their learning curve into the run."""
     run_dir = tmp_path / "debug-seed0"
     shutil.copytree(whole[0], run_dir)
     folders = learning.snapshots(run_dir)
@@ -278,7 +282,7 @@ def test_a_stop_where_a_snapshot_is_due_keeps_it(tmp_path, monkeypatch):
 
 @pytest.mark.slow(reason="compiles, simulates and draws in software, half a minute")
 def test_gait_strip(whole, tmp_path):
-    """Draws where an off-screen GL is installed; says in one line what to install where not."""
+    """With an off-screen GL the command draws. Without one, it says what to install."""
     out = tmp_path / "strip.png"
     args = [whole[0], "--speeds", "0.5", "1.0", "--seconds", "0.5", "--gait-strip", out]
     env = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
@@ -316,7 +320,8 @@ def test_damaged_checkpoint_falls_back_to_the_one_before(whole, tmp_path):
 
 
 class TestErrors:
-    """One line on stderr that starts with 'error:', exit code 2, no traceback."""
+    """Each error is one line on stderr that starts with 'error:', with exit code 2 and no
+    traceback."""
 
     @pytest.fixture
     def fails(self, capsys):
@@ -398,7 +403,8 @@ class TestErrors:
 
 
 def test_killed_before_its_first_checkpoint(whole, tmp_path, capsys):
-    """There is nothing to resume, and nothing that a new start would lose."""
+    """Without a checkpoint a run cannot resume, and a new start may overwrite it. A run with more
+    records is not overwritten."""
     run_dir = tmp_path / "r"
     (run_dir / "checkpoints").mkdir(parents=True)
     shutil.copy(whole[0] / "config.json", run_dir)
@@ -407,7 +413,7 @@ def test_killed_before_its_first_checkpoint(whole, tmp_path, capsys):
     assert "no checkpoint" in capsys.readouterr().err
     cli(*DEBUG, "--run-dir", run_dir)
     assert numbers(records(run_dir)) == numbers(records(whole[0]))
-    shutil.rmtree(run_dir / "checkpoints")  # but eight records are something to lose
+    shutil.rmtree(run_dir / "checkpoints")  # eight records remain
     assert train.main([*DEBUG, "--run-dir", str(run_dir)]) == 2
     assert "already holds a training" in capsys.readouterr().err
 
@@ -420,7 +426,8 @@ def test_the_first_train_step_is_saved_at_once(tmp_path):
 
 
 def test_a_longer_run_is_remembered(whole, tmp_path):
-    """What is stopped after --resume --steps goes on to the same end without --steps."""
+    """The run folder stores the length that --resume --steps gives. A later --resume trains to the
+    same end without --steps."""
     shutil.copytree(whole[0], tmp_path / "r")
     cli("--resume", "--run-dir", tmp_path / "r", "--steps", 1152)
     assert run_folder.read_config(tmp_path / "r").run.steps == 1152
@@ -466,7 +473,7 @@ def test_versions_known_to_hang_are_refused():
 
 
 def test_progress_fits_into_80_columns():
-    """The live table: all that matters is readable on the narrowest usual terminal."""
+    """The live table fits into 80 columns and cuts none of these values."""
     record = dict.fromkeys(
         ["env_steps", "steps_per_second", "seconds", "episode_steps", "tracking", "fast_tracking"],
         1.0,

@@ -1,4 +1,4 @@
-"""The structure of the package: imports point one way, and judging a policy needs no training."""
+"""The structure of the package: imports have no cycle, and the evaluation needs no training."""
 
 import ast
 import importlib.util
@@ -28,15 +28,15 @@ NO_TRAINING = [n for n in MODULES if n.startswith(WINGS) or n in ("kslc_jax.poli
 
 OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "viser"}
 OPTIONAL |= {"kslc_jax.viewer.panel": "viser"}
-"""Modules whose package may not be installed."""
+"""Modules that need an optional package, with its name."""
 
 LIGHT = ("config", "robots", "errors", "files", "cli", "train", "evaluate", "sim2sim", "play")
 LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "evaluation.tables")
-"""Modules that are there before JAX is: a config can be checked, and `--help` is quick."""
+"""Modules that do not import JAX, so that a config check and `--help` are quick."""
 
 
 def imported(tree: ast.AST, package: str) -> set[str]:
-    """Modules of this package that a module imports, anywhere in its text, also for types only."""
+    """Modules of this package that a module imports: anywhere in its text, also only for types."""
     found = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -46,7 +46,7 @@ def imported(tree: ast.AST, package: str) -> set[str]:
             module = node.module or ""
             names = {f"{module}.{alias.name}" for alias in node.names}
             submodules = names & MODULES.keys()
-            # `from package import module` needs the package's own file only for other names.
+            # `from package import module` counts as an import of the module, not of the package.
             found |= submodules or {module}
     return {name for name in found if name in MODULES and name != package}
 
@@ -60,7 +60,7 @@ def test_imports_have_no_circle():
 
 
 def reached(name: str) -> set[str]:
-    """All modules of this package that a module imports, at once or later."""
+    """All modules of this package that a module imports, directly or through other modules."""
     found, todo = set(), [name]
     while todo:
         new = GRAPH[todo.pop()] - found
@@ -71,12 +71,12 @@ def reached(name: str) -> set[str]:
 
 @pytest.mark.parametrize("name", NO_TRAINING)
 def test_judging_and_looking_import_no_training(name):
-    """Not even inside a function."""
+    """This includes imports inside functions."""
     assert not [other for other in reached(name) if other.startswith("kslc_jax.training")]
 
 
 def loaded_by(*modules: str) -> dict[str, set[str]]:
-    """The modules that a fresh process has after each of these imports, one after the other."""
+    """The loaded modules of a fresh process after each of these imports, one after the other."""
     code = "import importlib, json, sys\nfor name in sys.argv[1:]:\n"
     code += "    importlib.import_module(name)\n    print(json.dumps([name, [*sys.modules]]))"
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""The whole train step: windows, one trace, determinism, masks, symmetry."""
+"""The whole train step: windows, one trace, determinism, masks, entropy, curriculum input."""
 
 import dataclasses
 
@@ -13,14 +13,14 @@ from kslc_jax.config import preset
 
 @pytest.fixture(scope="module")
 def made():
-    """Debug preset: config, initial state maker, compiled train step."""
+    """Debug preset: (config, init, jitted step)."""
     config = preset("debug")
     init, step = train_step.make(config)
     return config, init, step
 
 
 def leaves(state):
-    """All leaves as numpy; keys as their data."""
+    """All leaves as numpy arrays; a random key as its data."""
     return [checkpoint_format.host_array(x) for x in jax.tree.leaves(state)]
 
 
@@ -30,7 +30,7 @@ def assert_same(a, b):
 
 
 def test_same_seed_same_bits_and_one_trace(made):
-    """Two runs of three train steps from one seed are bit-identical; step is traced once."""
+    """Two runs of three train steps from one seed are bit-identical. The step is traced once."""
     config, init, step = made
     finals = []
     for _ in range(2):
@@ -55,7 +55,7 @@ def test_state_is_donated(made):
 
 @pytest.mark.parametrize(("fades", "v_max", "coef"), [(True, 3.5, 0.00075), (False, 3.5, 0.003)])
 def test_entropy_bonus_fades_with_the_way_that_is_left(made, fades, v_max, coef):
-    """0.003 at 0.5 m/s, nothing at 4.5: a quarter at 3.5."""
+    """0.003 at v_max 0.5 m/s and 0 at 4.5 m/s: a quarter of it at 3.5 m/s."""
     config, init, _ = made
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, entropy_fades=fades))
     state = init()
@@ -74,7 +74,7 @@ def test_metrics_are_finite_and_named(made):
 
 
 def test_gathered_windows_equal_stacked_histories(made):
-    """Histories rebuilt from single frames equal those the actor saw, across resets."""
+    """Histories rebuilt from single frames equal those that the actor saw, also across resets."""
     config, init, _ = made
     envs = init().env
     # Random ages and full histories, as in the middle of a training.
@@ -96,7 +96,7 @@ def test_gathered_windows_equal_stacked_histories(made):
             k,
         )[0]
     )
-    for i in range(8):  # the time limit strikes after four steps
+    for i in range(8):  # the time limit ends all episodes after four steps
         seen.append(state.history)
         frames.append(state.history[:, -1])
         ages.append(state.time)
@@ -121,7 +121,7 @@ def test_broken_samples_are_masked(made):
 
 
 def test_paper_preset_traces():
-    """The whole paper-sized train step has consistent shapes (traced, not run)."""
+    """The train step of the paper's size has consistent shapes. It is traced, not run."""
     config = preset("paper")
     state = jax.eval_shape(lambda: train_step.init(config, 0))
     new, _ = jax.eval_shape(lambda s: train_step.step(config, s), state)
@@ -131,7 +131,7 @@ def test_paper_preset_traces():
 
 @pytest.mark.slow(reason="trains for about three minutes")
 def test_small_training_earns_more_and_more():
-    """256 environments, 60 updates: the reward grows by a tenth at least."""
+    """With 256 environments and 60 updates, the reward grows by at least a tenth."""
     base = preset("laptop")
     config = dataclasses.replace(base, env=dataclasses.replace(base.env, num_envs=256))
     init, step = train_step.make(config)
@@ -143,9 +143,9 @@ def test_small_training_earns_more_and_more():
 
 
 def test_what_update_and_curriculum_are_given(made, monkeypatch):
-    """Samples are seen by the update as they were by the rollout; advantages and the curriculum's
-    averages by hand. Half of the episodes end at the time limit in mid-rollout, one robot is
-    broken from the start."""
+    """The update sees the samples as the rollout saw them. Advantages and the averages of the
+    curriculum equal those by hand. Half of the episodes reach the time limit in the rollout; one
+    robot is broken from the start."""
     config, init, _ = made
 
     def update(ppo_config, apply, constants, learner, samples, key):
@@ -189,7 +189,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
         ("episode_steps", out.episode_steps, done),
         ("gait", out.terms["feet_contact_number"], out.fast),
     ):
-        average = float(getattr(new.curriculum, name))  # starts at 0, of which it keeps 0.95
+        average = float(getattr(new.curriculum, name))  # 0.95 * 0 + 0.05 * new
         assert average == pytest.approx(0.05 * x[mask & ~out.broken].mean(), rel=1e-4), name
     assert int(new.curriculum.updates) == 1
     keys = [jax.random.key_data(train_step.step_keys(x)[0]) for x in (state, new)]
@@ -203,8 +203,8 @@ def test_robots_start_unlike_each_other(made):
 
 
 def test_slow_commands_at_the_top_count_as_if_they_were_faster():
-    """Commands of 0.5 and 3.0 m/s, run at 0.4 and 3.3: off by -0.1 + 0.3, measured against 2.0 and
-    3.0. The third command has not settled, the fourth is not at the top."""
+    """Commands of 0.5 and 3.0 m/s give speeds of 0.4 and 3.3 m/s: deviation -0.1 + 0.3, scale 2.0 +
+    3.0. The third command has not settled, and the fourth is not at the top."""
     no = jnp.zeros(4, bool)
     out = env.Outcome(
         reward=jnp.zeros(4),

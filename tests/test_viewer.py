@@ -1,4 +1,4 @@
-"""Playing a policy live: the session, the pacer, the viewer's figure and panel, and the page."""
+"""The live viewer: session, pacer, figure, panel, page. Also `play`: films and errors."""
 
 import dataclasses
 import io
@@ -31,8 +31,8 @@ BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 
 @pytest.fixture(scope="module")
 def still():
-    """A policy that asks for the default pose whatever it sees, from always the same start: one
-    config, so that all tests share what is compiled."""
+    """A policy that always commands the default pose, and always starts in the same pose. All tests
+    use its config, so that they share the compiled programs."""
     base = preset("debug")
     env = dataclasses.replace(base.env, reset_joint_noise=0.0)
     quiet = dataclasses.replace(base, env=env, physics=C_MUJOCO)
@@ -42,7 +42,7 @@ def still():
 
 @pytest.fixture(scope="module")
 def run_dir(still, tmp_path_factory):
-    """A run folder with the checkpoints 2 and 10 of that policy."""
+    """A run folder with the checkpoints 2 and 10 of the policy `still`."""
     root = tmp_path_factory.mktemp("run")
     reached = {"curriculum/v_max": 1.5, "curriculum/cycle_time": 0.6}
     meta = {"schema": 1, "config": config.to_dict(still.config), "metrics": reached}
@@ -74,7 +74,7 @@ def test_pacer_forgets_what_it_cannot_make_up_for():
 
 
 def test_a_session_is_a_trial(still):
-    """Same start, same command, same policy: the same motion as `trials.run`."""
+    """With the same start, command and policy, the motion equals that of `trials.run`."""
     command = np.array([0.3, 0.1, 0.2])
     trace = next(trials.run(still, trials.Setting(C_MUJOCO), command[None]))
     live = session.Session(still, C_MUJOCO)
@@ -116,7 +116,7 @@ def test_a_fallen_robot_lies_a_second_and_starts_anew(still):
 
 
 def volume(model, geom) -> float:
-    """Of a primitive [m^3]."""
+    """Volume of a primitive geom [m^3]."""
     a, b, c = model.geom_size[geom]
     kinds = mujoco.mjtGeom
     return {
@@ -143,7 +143,7 @@ def test_meshes_have_the_geoms_size_and_place():
 
 @pytest.fixture(scope="module")
 def viewer(run_dir):
-    """A viewer on a free port; nothing runs but what a test asks for."""
+    """A viewer on a free port. It steps only when a test calls `frame`."""
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
     from kslc_jax.viewer.app import Viewer
 
@@ -206,7 +206,8 @@ def test_frames_step_only_while_watched(viewer, monkeypatch):
 
 
 def test_the_page_says_when_it_is_too_slow(viewer, monkeypatch):
-    """Frames 0.2 s apart make up for 0.1 s: half of real time at 1x, all that is asked at 0.5x."""
+    """Frames come 0.2 s apart, and each simulates at most 0.1 s. This is half of real time: too
+    slow at 1x, enough at 0.5x."""
     monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: None})
     titles = []
     monkeypatch.setattr(viewer.panel._gui, "set_panel_label", titles.append)
@@ -223,7 +224,7 @@ def test_the_page_says_when_it_is_too_slow(viewer, monkeypatch):
     viewer.panel.rate.value = "0.5x"
     assert "\nreal-time factor 0.50, train step" in play(1009.5, 0.2, 40)
     viewer.panel.rate.value = "1x"
-    viewer.reset()  # a fallen robot is that first
+    viewer.reset()  # the status of a fallen robot is "fallen", not "paused"
     viewer.panel._pause()
     assert "paused" in play(1017.5, 0.05, 1) and titles[-1] == "kslc_jax"
     viewer.panel._pause()
@@ -310,7 +311,7 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
 
 @pytest.fixture
 def blank_renderer(monkeypatch):
-    """Draws black pictures, without GL."""
+    """Replaces the renderer by one that gives black pictures without GL."""
     blank = SimpleNamespace(frames=lambda qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos))
     monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
     monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
@@ -326,7 +327,7 @@ def film_two_speeds(out: Path) -> None:
 
 
 def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
-    """Two speeds of half a second each at 50 frames a second, with text."""
+    """The film has two speeds, half a second each at 50 frames a second, with text."""
     imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
     pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
     said = []
@@ -343,8 +344,9 @@ def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("suffix", play.ANIMATIONS)
 def test_animations_last_as_long_and_repeat(suffix, blank_renderer, monkeypatch, tmp_path):
-    """Every fourth of 2 x 50 steps of 10 ms is a picture of 40 ms. Equal pictures may be stored as
-    one that lasts longer, so that only the sum is known. imageio is not needed."""
+    """Every fourth of 2 x 50 steps of 10 ms is a picture of 40 ms. The file may store equal
+    pictures as one longer picture, so the test checks the total time. imageio_ffmpeg is not
+    needed."""
     from PIL import Image, ImageSequence
 
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
@@ -392,7 +394,8 @@ def test_a_gl_that_does_not_work_is_named(tmp_path):
 
 @pytest.mark.slow(reason="a minute: a browser that draws in software")
 def test_the_page(run_dir):
-    """In a real browser: no error, the robot is in the picture, a slider commands it."""
+    """In a real browser there is no error, the picture shows the robot, and slider and key change
+    the command."""
     pytest.importorskip("viser", reason="the extra 'viewer' is not installed")
     playwright = pytest.importorskip("playwright.sync_api", reason="pip install playwright")
     browser_path = next(filter(None, map(shutil.which, BROWSERS)), None)
@@ -421,7 +424,7 @@ def test_the_page(run_dir):
             page.on("pageerror", lambda error: errors.append(str(error)))
             page.goto(f"http://127.0.0.1:{made.server.get_port()}")
             page.get_by_text("commanded, ").wait_for()
-            # While it connects, viser shows its own address in a field of text.
+            # While viser connects, it shows its own address in a text field.
             vx = page.locator("input[inputmode=decimal]:visible").first
             vx.fill("0.75")
             vx.press("Enter")
@@ -440,7 +443,7 @@ def test_the_page(run_dir):
 
 
 def colours_of_the_robot(png: bytes) -> float:
-    """Share of a picture's pixels that have the orange of the joints."""
+    """Share of the pixels of a picture that have the orange of the joints."""
     from PIL import Image
 
     rgb = np.asarray(Image.open(io.BytesIO(png)).convert("RGB"), float)

@@ -1,4 +1,4 @@
-"""The built wheel, installed with its extras into an environment of its own, away from the code."""
+"""The built wheel, installed with its extras into a new environment, away from the source code."""
 
 import os
 import shutil
@@ -16,7 +16,7 @@ SOURCES = ("kslc_jax", "pyproject.toml", "README.md", "LICENSE", "NOTICE")
 TRAINED = ("--preset", "debug", "--run-dir")
 SHORT = ("--speeds", "1", "--seeds", "1", "--seconds", "3")
 
-pytestmark = pytest.mark.slow  # builds a wheel and installs JAX anew: minutes, and a network
+pytestmark = pytest.mark.slow  # builds a wheel and installs JAX: takes minutes and a network
 
 
 def run(*command: object, cwd: Path) -> str:
@@ -32,7 +32,7 @@ def run(*command: object, cwd: Path) -> str:
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("wheel")
-    for name in SOURCES:  # a copy: the build leaves folders beside what it builds
+    for name in SOURCES:  # a copy, because the build leaves folders beside the sources
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, folder / name)
     run(sys.executable, "-m", "pip", "wheel", ".", "--no-deps", "-q", "-w", "out", cwd=folder)
@@ -42,7 +42,7 @@ def wheel(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def python(wheel, tmp_path_factory) -> Path:
-    """The interpreter of an environment with the wheel; nobody may write into the package."""
+    """The Python of an environment with the wheel. The package in it is read-only."""
     folder = tmp_path_factory.mktemp("environment")
     run(sys.executable, "-m", "venv", folder, cwd=folder)
     python = folder / "bin" / "python"
@@ -61,7 +61,7 @@ def package(python: Path, cwd: Path) -> Path:
 
 
 def test_everything_is_in_the_wheel(wheel):
-    """Every module of every wing, the robots' models and the shipped policies."""
+    """Every module of every subpackage, the models of the robots, and the shipped policies."""
     kept = {f"kslc_jax/{p.relative_to(ROOT / 'kslc_jax')}" for p in files_of(ROOT / "kslc_jax")}
     with zipfile.ZipFile(wheel) as archive:
         packed = {name for name in archive.namelist() if name.startswith("kslc_jax/")}
@@ -74,7 +74,7 @@ def files_of(folder: Path) -> list[Path]:
 
 
 def test_commands_run_from_an_installed_package(python, tmp_path):
-    """None writes into the package, which root could do in spite of its rights."""
+    """No command writes into the package. The times are compared, because root may always write."""
     installed = package(python, tmp_path)
     assert ROOT not in installed.parents
     before = {path: path.stat().st_mtime_ns for path in installed.rglob("*")}

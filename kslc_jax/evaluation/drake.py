@@ -1,10 +1,10 @@
 """A second, independent engine: Drake's SAP contact solver with hydroelastic feet.
 
-The plant takes its numbers from the compiled MuJoCo model (masses, frames, limits, shapes) and
-nothing of its dynamics. `step` has the signature of `physics.step`, so that a policy meets the same
-environment, signals and observations. MuJoCo only reads the kinematic sensors at Drake's state.
+The plant takes masses, frames, limits and shapes from the compiled MuJoCo model. Drake computes the
+dynamics. `step` has the signature of `physics.step`, so that a policy meets the same environment,
+signals and observations. MuJoCo only computes the kinematic sensors at Drake's state.
 
-Needs the package drake: pip install 'kslc_jax[drake]'.
+It needs the package drake: pip install 'kslc_jax[drake]'.
 """
 
 import copy
@@ -44,25 +44,25 @@ SLAB = 0.1
 """Depth [m] over which the floor's pressure rises from zero to `MODULUS`."""
 
 MODULUS = 1e7
-"""Pressure [Pa]: the standing robot sinks in by 0.2 mm."""
+"""Pressure of the floor at the depth `SLAB` [Pa]. The standing robot sinks in by 0.2 mm."""
 
 DISSIPATION = 1.0
 """Hunt-Crossley dissipation of the contact [s/m]."""
 
 FEET = ("left_foot", "right_foot")
-"""Geoms whose force on the floor is measured; the sensors are called after them."""
+"""Geoms whose force on the floor is measured. Their sensors have the names FOOT_touch."""
 
 KINEMATICS = (
     mujoco.mj_kinematics,
     mujoco.mj_comPos,
     mujoco.mj_comVel,
-    mujoco.mj_subtreeVel,  # asked for by name: mj_sensorVel takes it to be up to date
+    mujoco.mj_subtreeVel,  # explicit, because mj_sensorVel expects it to be up to date
     mujoco.mj_sensorPos,
     mujoco.mj_sensorVel,
 )
-"""Stages of MuJoCo after which its position and velocity sensors hold."""
+"""Stages of MuJoCo that compute its position and velocity sensors."""
 
-# It warns of deformable bodies, of which there are none, at every half space.
+# Drake warns about deformable bodies at every half space; the model has none.
 logging.getLogger("drake").setLevel(logging.ERROR)
 
 _lock = threading.Lock()
@@ -70,16 +70,16 @@ _lock = threading.Lock()
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """One simulated robot with its parameters fixed; `context` and `data` are overwritten."""
+    """One simulated robot with fixed parameters. Each step overwrites `context` and `data`."""
 
     robot: Robot
-    data: mujoco.MjData  # of the model that the plant was built from, for the kinematic sensors
+    data: mujoco.MjData  # for the kinematic sensors; its model is that of the plant
     diagram: Diagram
     plant: MultibodyPlant
     context: Context  # of the diagram
     feet: tuple[GeometryId, ...]  # left and right
-    q_index: np.ndarray  # [23] where our qpos lies in Drake's positions
-    v_index: np.ndarray  # [22] where our qvel lies in Drake's velocities
+    q_index: np.ndarray  # [23] index in Drake's positions of each element of qpos
+    v_index: np.ndarray  # [22] index in Drake's velocities of each element of qvel
 
     @property
     def plant_context(self) -> Context:
@@ -91,9 +91,9 @@ class World:
 
 
 def build(robot: Robot, model: mujoco.MjModel) -> World:
-    """The robot on a half space, with the parameters of `model` (the robot's, or a changed copy).
+    """Builds the robot on a half space, with the parameters of `model`.
 
-    One friction for everything, that of the feet.
+    `model` is the robot's model or a changed copy. All shapes have the friction of the feet.
     """
     builder = DiagramBuilder()
     settings = MultibodyPlantConfig(
@@ -119,17 +119,17 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
         plant=plant,
         context=diagram.CreateDefaultContext(),
         feet=tuple(ids[name] for name in FEET),
-        # Drake: quaternion, position; rate, velocity. MuJoCo: the other way round.
+        # Drake's order: quaternion, position; angular, linear velocity. MuJoCo's is the reverse.
         q_index=np.r_[q + 4 : q + 7, q : q + 4, [j.position_start() for j in joints]],
         v_index=np.r_[v + 3 : v + 6, v : v + 3, [j.velocity_start() for j in joints]],
     )
 
 
 def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> None:
-    """Bodies, hinges and motors, in the robot's joint order.
+    """Adds bodies, hinges and motors, in the robot's joint order.
 
-    The servos' damping goes into the joints, which Drake integrates implicitly: all of it, where
-    MuJoCo is given `motors.motor_damping`.
+    The joints get the full damping of the servos, and Drake integrates it implicitly. MuJoCo gets
+    the part that `motors.motor_damping` gives.
     """
     for i in range(1, model.nbody):
         plant.AddRigidBody(model.body(i).name, _inertia(model, i))
@@ -150,7 +150,7 @@ def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> N
 
 
 def _inertia(model: mujoco.MjModel, body: int) -> SpatialInertia:
-    """Mass and inertia of a body about its frame's origin."""
+    """Mass and inertia of a body about the origin of its frame."""
     turn = RotationMatrix(Quaternion(model.body_iquat[body])).matrix()
     central = turn @ np.diag(model.body_inertia[body]) @ turn.T
     return SpatialInertia.MakeFromCentralInertia(
@@ -163,7 +163,7 @@ def _inertia(model: mujoco.MjModel, body: int) -> SpatialInertia:
 def _add_shapes(
     plant: MultibodyPlant, model: mujoco.MjModel, friction: float
 ) -> dict[str, GeometryId]:
-    """Every geom that collides: rigid feet on a compliant floor, point contact for the rest."""
+    """Adds every geom that collides: rigid feet, a compliant floor, point contact for the rest."""
     ids = {}
     for i in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
         geom = model.geom(int(i))
@@ -184,7 +184,7 @@ def _add_shapes(
 
 
 def _shape(geom) -> geometry.Shape:
-    """Drake's shape for a geom; MuJoCo gives half lengths."""
+    """Drake's shape for a geom. MuJoCo's sizes are half lengths."""
     kind = mujoco.mjtGeom(int(geom.type[0]))
     a, b, c = map(float, geom.size)
     match kind:
@@ -202,7 +202,10 @@ def _shape(geom) -> geometry.Shape:
 
 
 def _exclude(plant: MultibodyPlant, scene: SceneGraph, model: mujoco.MjModel) -> None:
-    """The pairs of bodies that the model lets overlap; both engines skip a body and its parent."""
+    """Excludes the contacts that the model excludes.
+
+    Both engines skip the contacts of a body with its parent anyway.
+    """
 
     def shapes_of(body: int) -> geometry.GeometrySet:
         link = plant.GetBodyByName(model.body(body).name)
@@ -228,7 +231,7 @@ def set_state(world: World, qpos: np.ndarray, qvel: np.ndarray) -> None:
 
 
 def get_state(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """qpos [23] and qvel [22] in MuJoCo's conventions."""
+    """The robot's qpos [23] and qvel [22] in MuJoCo's conventions."""
     qpos = world.plant.GetPositions(world.plant_context)[world.q_index]
     qvel = world.plant.GetVelocities(world.plant_context)[world.v_index]
     mujoco.mju_normalize4(qpos[3:7])
@@ -239,9 +242,9 @@ def get_state(world: World) -> tuple[np.ndarray, np.ndarray]:
 def advance(
     world: World, state: PhysicsState, target: np.ndarray, dynamics: Dynamics, steps: int
 ) -> PhysicsState:
-    """`steps` physics steps of one robot towards `target` [16, rad]; numpy in, numpy out.
+    """Does `steps` physics steps of one robot towards `target` [16, rad]; numpy in, numpy out.
 
-    A step that Drake gives up on leaves NaN, as a diverged one does in MuJoCo.
+    If Drake fails in a step, qpos and qvel are NaN, like those of a diverged step in MuJoCo.
     """
     robot, motors = world.robot, world.plant.get_actuation_input_port()
     joint_friction = world.data.model.dof_frictionloss[6:]
@@ -259,14 +262,14 @@ def advance(
             new = world.diagram.EvalUniquePeriodicDiscreteUpdate(world.context)
             world.context.get_mutable_discrete_state().SetFrom(new)
         qpos, qvel = get_state(world)
-    except (RuntimeError, SystemExit):  # the latter where Drake demands finite numbers
+    except (RuntimeError, SystemExit):  # Drake raises SystemExit for non-finite numbers
         qpos, qvel = np.full(state.qpos.shape, np.nan), np.full(state.qvel.shape, np.nan)
     sensordata = _sensordata(world, qpos, qvel, forces)
     return state.replace(qpos=qpos, qvel=qvel, sensordata=sensordata, torque=torque)
 
 
 def foot_forces(world: World) -> np.ndarray:
-    """Normal force between each foot and the floor [2, N] in the present state."""
+    """Normal force between each foot and the floor in the present state: [2], in newtons."""
     contacts = world.plant.get_contact_results_output_port().Eval(world.plant_context)
     forces = np.zeros(len(world.feet))
     for i in range(contacts.num_hydroelastic_contacts()):
@@ -278,7 +281,7 @@ def foot_forces(world: World) -> np.ndarray:
 
 
 def _sensordata(world: World, qpos: np.ndarray, qvel: np.ndarray, forces: np.ndarray) -> np.ndarray:
-    """Drake's foot forces, and the sensors that follow from the state by MuJoCo's kinematics."""
+    """All sensors: Drake's foot forces, and the kinematic sensors that MuJoCo computes."""
     model, data = world.data.model, world.data
     data.qpos[:], data.qvel[:] = qpos, qvel
     for stage in KINEMATICS:
@@ -295,7 +298,10 @@ def step(
     dynamics: Dynamics,
     ground_friction: float,
 ) -> PhysicsState:
-    """`physics.step` in Drake: one control step of one environment; vmapped ones take turns."""
+    """`physics.step` in Drake: one control step of one environment.
+
+    Under vmap the environments take turns.
+    """
     fields = model_fields(physics.robot_for(config), dynamics, ground_friction)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
     call = functools.partial(_host_step, config)
@@ -309,7 +315,10 @@ def _host_step(
     dynamics: Dynamics,
     fields: dict[str, np.ndarray],
 ) -> PhysicsState:
-    """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us."""
+    """`step` on the host: numpy in, numpy out.
+
+    It must not call JAX: that call would wait for the program that waits for this callback.
+    """
     state, target, dynamics, fields = jax.tree.map(
         lambda x: np.asarray(x, np.float64), (state, target, dynamics, fields)
     )
@@ -321,7 +330,7 @@ def _host_step(
 
 @functools.lru_cache(maxsize=64)
 def _world(config: PhysicsConfig, changes: tuple[tuple[str, bytes], ...]) -> World:
-    """The robot with some fields of its model changed."""
+    """A `World` of the robot with some fields of its model changed; the last 64 are kept."""
     robot = physics.robot_for(config)
     model = copy.copy(robot.mj_model)
     for name, raw in changes:

@@ -1,8 +1,9 @@
-"""Numbers that describe how a robot moves, from a `Trace`, in numpy.
+"""Metrics of a robot's motion, from a `Trace`, in numpy.
 
-All take the trace of one commanded speed, [T, N, ...], after some time to settle; trials that fell
-count as 0 m/s in the mean speed and nowhere else. `summary` puts them together. Angular momenta are
-about the whole-body centre of mass (paper, Eq. 3).
+All functions take the trace of one commanded speed, [T, N, ...], and use the time after `SETTLE`. A
+trial that fell counts as 0 m/s in `forward_mean` and `forward_rmse`; the metrics of speed
+variation, effort, strides, symmetry and momentum leave it out. `summary` joins all metrics. Angular
+momenta are about the whole-body centre of mass (paper, Eq. 3).
 """
 
 import mujoco
@@ -14,20 +15,20 @@ from kslc_jax.robot import Robot
 
 GRAVITY = 9.81
 SETTLE = 2.0
-"""Seconds at the start that do not count: the robot gathers speed."""
+"""Seconds at the start that do not count, because the robot gathers speed."""
 
 RESTING = 0.1
-"""Mean forward speed [m/s] below which there is no transport to have a cost, and no stride."""
+"""Mean forward speed [m/s]. At or below it, cost of transport and stride length are not defined."""
 
 MOMENTUM_EVERY = 0.05
-"""Seconds between the samples of the limbs' angular momentum."""
+"""Seconds between two samples of the limbs' angular momentum."""
 
 CHATTER = 0.05
-"""Seconds off the ground below which a foot has not left it."""
+"""Seconds. A foot that leaves the ground for a shorter time counts as still on it."""
 
 
 def _steady(trace: Trace, dt: float) -> Trace:
-    """The trace after settling, of the trials that did not fall."""
+    """The part of the trace after `SETTLE`, for the trials that did not fall."""
     start = round(SETTLE / dt)
     upright = trace.alive[-1]
     fields = {n: getattr(trace, n)[start:, upright] for n in trace.__dataclass_fields__}
@@ -35,20 +36,22 @@ def _steady(trace: Trace, dt: float) -> Trace:
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Mean over trials of the correlation in time of [T, N] signals; 0 where nothing moves."""
+    """Correlation over time of two signals [T, N], as a mean over trials; 0 for constant ones."""
     a, b = a - a.mean(0), b - b.mean(0)
     scale = np.sqrt((a**2).sum(0) * (b**2).sum(0))
     return float(np.mean(np.where(scale > 1e-6, (a * b).sum(0) / np.maximum(scale, 1e-6), 0.0)))
 
 
 def _difference(left: float, right: float) -> float:
-    """|left - right| as a share of their mean."""
+    """|left - right| divided by the mean of their absolute values."""
     return abs(left - right) / max(0.5 * (abs(left) + abs(right)), 1e-6)
 
 
 def _interval(name: str, per_trial: np.ndarray) -> dict[str, float]:
-    """Half width of the 95 % confidence interval of a mean over trials (Student's t), as NAME_ci;
-    one trial has none."""
+    """Half width of the 95 % confidence interval of a mean over trials, as NAME_ci.
+
+    It uses Student's t. One trial has no interval.
+    """
     count = len(per_trial)
     if count < 2:
         return {}
@@ -57,7 +60,10 @@ def _interval(name: str, per_trial: np.ndarray) -> dict[str, float]:
 
 
 def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
-    """Tracking as the paper measures it: mean forward velocity, 0 for a trial that fell."""
+    """Survival and velocity tracking.
+
+    The mean forward velocity is the paper's measure; a trial that fell counts as 0 m/s.
+    """
     start = round(SETTLE / dt)
     upright = trace.alive[-1]
     mean = np.where(upright, trace.linvel[start:, :, 0].mean(0), 0.0)
@@ -91,12 +97,12 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
 
 
 def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
-    """Use of the motors, and cost of transport.
+    """Load of the motors, and cost of transport.
 
-    The cost of transport is the mechanical work of the motors per weight moved and metre gone,
-    P / (m g |vx|), without a unit. P [W] is sum |torque x joint speed|: a motor that brakes gives
-    nothing back, heat is not counted. m [kg] is the robot with its payload, vx [m/s] the base's
-    forward velocity. Means are over time and trials.
+    The cost of transport [] is the mechanical work of the motors per weight and distance,
+    P / (m g |vx|). P [W] is sum |torque x joint speed|: a braking motor costs as much as a driving
+    one, and heat does not count. m [kg] is the mass of the robot with its payload. vx [m/s] is the
+    forward velocity of the base. Means are over time and trials.
     """
     s = _steady(trace, dt)
     power = np.abs(s.torque * s.joint_vel).sum(-1).mean()
@@ -113,8 +119,10 @@ def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 
 
 def _touchdowns(contact: np.ndarray, dt: float) -> np.ndarray:
-    """Landings [N, 2] of a contact record [T, N, 2]; a foot that chatters lands once, and one that
-    is down from the start has not landed."""
+    """Number of landings [N, 2] in a contact record [T, N, 2].
+
+    A foot that chatters lands once. A foot on the ground at the start has not landed.
+    """
     window = round(CHATTER / dt)
     padded = np.pad(contact, ((window, 0), (0, 0), (0, 0)), mode="edge")
     recently = np.any([padded[i : i + len(contact)] for i in range(window)], axis=0)
@@ -122,7 +130,7 @@ def _touchdowns(contact: np.ndarray, dt: float) -> np.ndarray:
 
 
 def strides(trace: Trace, dt: float) -> dict[str, float]:
-    """Stride frequency and length, flight, clearance, and how alike left and right are."""
+    """Stride frequency and length, flight, double support, clearance, left-right differences."""
     s = _steady(trace, dt)
     frequency = float(_touchdowns(np.asarray(s.contact), dt).mean() / (len(s.contact) * dt))
     swing_top = [
@@ -143,7 +151,7 @@ def strides(trace: Trace, dt: float) -> dict[str, float]:
 
 
 def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
-    """Joint ranges of the two sides, and arms against legs."""
+    """Left-right differences of joint ranges, arm swing, and its correlation with the leg swing."""
     s = _steady(trace, dt)
     q = np.asarray(s.qpos)[..., 7:]
     names = list(robot.joint_names)
@@ -156,7 +164,7 @@ def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
         for joint in ("leg_pitch", "knee", "shoulder_pitch")
     }
     out["shoulder_range"] = float(span["left_shoulder_pitch_joint"])
-    # Both axes point the same way on a side: equal signs swing arm and leg to the same side.
+    # On one side, shoulder and hip axes point the same way: equal signs swing both the same way.
     out["shoulder_hip_correlation"] = float(
         np.mean(
             [
@@ -172,12 +180,14 @@ def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 
 
 def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Angular momentum of every body about the whole-body CoM [bodies, 3], world, kg m^2/s, at the
-    qpos and qvel of `data`."""
+    """Angular momentum of every body about the whole-body CoM, at the qpos and qvel of `data`.
+
+    Returns [bodies, 3] in the world frame [kg m^2/s].
+    """
     for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
         stage(model, data)
     mujoco.mj_subtreeVel(model, data)
-    # cvel is the velocity at the point of each body that is now at the whole-body CoM.
+    # cvel is the velocity of the point of each body that coincides with the whole-body CoM.
     spin, at_com = data.cvel[:, :3], data.cvel[:, 3:]
     arm = data.xipos - data.subtree_com[0]
     moving = at_com + np.cross(spin, arm) - data.subtree_linvel[0]
@@ -188,8 +198,11 @@ def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
-    """Root mean square angular momentum of the whole body, its arms and its legs: all of it, and
-    about the vertical alone. Arms and legs are taken without a payload."""
+    """RMS angular momentum [kg m^2/s] of the whole body, of the arms and of the legs.
+
+    Each has two values: of the whole vector, and of its vertical component. Arms and legs are
+    computed with the masses of the nominal model, without a payload.
+    """
     s = _steady(trace, dt)
     squares = (s.angular_momentum**2).mean((0, 1))
     out = {
@@ -219,7 +232,7 @@ def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 
 
 def summary(trace: Trace, command: float, robot: Robot, dt: float) -> dict[str, float]:
-    """Everything; only survival and speed where every trial fell."""
+    """All metrics. If every trial fell, only those of `speed`."""
     out = speed(trace, command, dt)
     if out["survival"] == 0.0:
         return out

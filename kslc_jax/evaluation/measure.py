@@ -1,4 +1,4 @@
-"""Metrics of a policy per commanded speed, over many trials each."""
+"""Metrics of a policy at each commanded speed, over many trials."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,7 +13,7 @@ from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
 
 MOST_SAMPLES = 2_000_000
-"""Control steps of all trials whose traces are held in memory at once, about 300 bytes each."""
+"""Most control steps, over all trials, that memory holds at once: about 300 bytes each."""
 
 Describe = Callable[[Trace, float, Robot, float], dict[str, float]]
 """(trace, command [m/s], robot, control step [s]) -> metrics by name."""
@@ -35,12 +35,12 @@ def measure(
     Args:
       policy: acts deterministically.
       setting: conditions.
-      speeds: commands.
+      speeds: commanded forward speeds [m/s].
       seeds: trials per command.
       seed: of initial states and randomisation.
-      progress: told the share that is done.
-      describe: the metrics of a trace; None: all of them, `gait_metrics.summary`.
-      vy, yaw_rate: commanded with every speed, to the left [m/s, rad/s].
+      progress: called with the share [] that is done.
+      describe: computes the metrics of a trace; the default is `gait_metrics.summary`.
+      vy, yaw_rate: commanded with every speed, positive to the left [m/s, rad/s].
     """
     describe = describe or gait_metrics.summary
     robot, dt = physics.robot_for(setting.physics), setting.physics.control_dt

@@ -1,4 +1,4 @@
-"""Rows of numbers as tables for people. Imports no JAX."""
+"""Prints metrics as tables. Imports no JAX."""
 
 import sys
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ SIDEWAYS_COLUMNS: Columns = (
     ("yaw_rate_mean", "mean yaw rate [rad/s]", "{:.2f}"),
     *HEADLINE[3:],
 )
-"""The same for commands with a side step or a turn, whose means follow the mean forward speed."""
+"""Columns for commands with a side step or a turn: mean vy and mean yaw rate follow mean vx."""
 
 
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
@@ -54,5 +54,5 @@ def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table
 
 
 def console() -> Console:
-    """A console as wide as the terminal, or where there is none as wide as the table."""
+    """A console as wide as the terminal. Without a terminal it is wide enough for the table."""
     return Console(highlight=False, width=None if sys.stdout.isatty() else 180)

@@ -1,1 +1,1 @@
-"""Looking at a policy: the live viewer, gait strips and films. Imports no training."""
+"""The live viewer, gait strips and films of a policy. Imports no training code."""

@@ -1,6 +1,6 @@
-"""The live viewer: a robot in the browser, and a command to change while it runs.
+"""The live viewer. It shows a robot in the browser; the user changes the command while it runs.
 
-Needs viser (pip install 'kslc_jax[viewer]') and no GL: the browser draws.
+It needs viser (pip install 'kslc_jax[viewer]'). It needs no GL, because the browser draws.
 """
 
 import collections
@@ -33,23 +33,23 @@ PANEL_HZ = 10
 """Redraws of plots and status text per second."""
 
 GAMMA = 2.2
-"""glTF takes linear colours, MuJoCo shows its own as they are."""
+"""Exponent from MuJoCo's colours to the linear colours that glTF takes."""
 
 CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
-"""Where the camera starts and looks, relative to the robot [m], and its field of view [degrees]."""
+"""Start position and target of the camera, relative to the robot [m]; field of view [degrees]."""
 
 SPEED_SECONDS = 1.0
-"""Span over which the actual speed and the real-time factor are taken."""
+"""Window for the means of the actual speed and of the real-time factor [s]."""
 
 SLOW = 0.95
-"""Share of the asked playback speed below which the page says that it is too slow."""
+"""Share of the chosen playback speed. Below it the page says "too slow"."""
 
 
 # -------------------------------------------------------------------------------------------- robot
 
 
 def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """A primitive geom in its body's frame, in its material's colour."""
+    """The mesh of a primitive geom: in the frame of its body, in the colour of its material."""
     kinds, create = mujoco.mjtGeom, trimesh.creation
     size = model.geom_size[geom]
     kind = model.geom_type[geom]
@@ -78,8 +78,8 @@ def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
 class Figure:
     """The robot and the floor in a viser scene.
 
-    With `follow` the world moves under a robot that stays in the picture, so that the user's camera
-    is left alone; without, the world stays where it is.
+    With `follow` the world moves under the robot, and the robot stays in the picture. The user's
+    camera does not move. Without `follow` the world stays and the robot moves.
     """
 
     def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
@@ -119,7 +119,7 @@ class Figure:
         )
 
     def show(self, view: View) -> None:
-        """Puts every body where the view has it."""
+        """Moves every body to its pose in the view."""
         qpos = np.asarray(view.qpos)
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
@@ -135,7 +135,7 @@ class Figure:
 
 
 def policies(given: Path) -> dict[str, Path]:
-    """Name to folder: the given policy, its run's other checkpoints, and the shipped ones."""
+    """Folders by name: the given policy, the other checkpoints of its run, the shipped policies."""
     folder = policy_lib.checkpoint_folder(given)
     found = {str(given): folder}
     others = [p for p in folder.parent.iterdir() if p.name.isdigit() and p != folder]
@@ -147,9 +147,12 @@ def policies(given: Path) -> dict[str, Path]:
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
-    """A web server at exactly this address; ConfigError if it cannot be had (0: any free port)."""
+    """A web server at exactly this address; port 0 takes any free port.
+
+    ConfigError if the address is not available.
+    """
     try:
-        # viser would quietly take the next free port, and never return from an unknown host.
+        # Checked here: viser takes the next free port silently, and hangs with an unknown host.
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         socket.create_server((host, port), family=family).close()
     except OSError as error:
@@ -178,14 +181,14 @@ class Viewer:
         self._name = next(iter(self._policies))
         loaded = load_policy(policy)
         self.server = serve(host, port)
-        # Whatever is simulated: the training model has shapes that are not to be seen.
+        # Always the high-fidelity model: some shapes of the training model must not be seen.
         self.figure = Figure(self.server, robot_lib.load("high").mj_model)
         self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
         self._rng = np.random.default_rng(seed)
         self._play(loaded)
 
     def _play(self, policy: Policy) -> None:
-        """A new session with this policy."""
+        """Starts a new session with this policy."""
         self.session = Session(policy, trials.engine(policy, self._fidelity), self._seed)
         self.session.advance(np.zeros(3))  # compiles
         self.panel.allow(float(policy.curriculum.v_max))
@@ -198,13 +201,13 @@ class Viewer:
         self.reset()
 
     def reset(self) -> None:
-        """Starts the robot anew."""
+        """Puts the robot back to the start of an episode."""
         self.session.reset()
         self._recent.clear()
         self.figure.show(self.session.view)
 
     def _switch(self, name: str) -> None:
-        """Plays the policy of this name; where it cannot be loaded, says so and plays on."""
+        """Plays the policy of this name. If loading fails, tells the user and keeps the old one."""
         self._name = name
         self.panel.status.content = f"loading {name} ..."
         try:
@@ -214,7 +217,7 @@ class Viewer:
                 client.add_notification("Not loaded", str(error), color="red")
 
     def frame(self, now: float) -> None:
-        """Simulates what is due at the clock time `now` [s] and draws it."""
+        """Does the control steps that are due at the clock time `now` [s] and draws the result."""
         if self.panel.policy.value != self._name:
             self._switch(self.panel.policy.value)
         if self.panel.take_reset():
@@ -236,10 +239,10 @@ class Viewer:
             self._report()
 
     def _report(self) -> None:
-        """Plots and status text."""
+        """Updates the plots and the status text."""
         seconds, simulated, wanted = np.subtract(self._paced[-1], self._paced[0])
         factor = simulated / max(seconds, 1e-6)
-        slow = simulated < SLOW * wanted - self.session.dt  # a step may be due and not yet done
+        slow = simulated < SLOW * wanted - self.session.dt  # one due step may still be missing
         self.panel.title(factor, slow)
         self.panel.plot(list(self._recent), self._paced[-1][1], self.session.dt)
         last = [v.velocity[0] for v in self._recent][-round(SPEED_SECONDS / self.session.dt) :]
@@ -253,7 +256,7 @@ class Viewer:
         )
 
     def run(self) -> None:
-        """Serves until it is interrupted."""
+        """Runs the viewer until an interrupt, then stops the server."""
         try:
             while True:
                 began = time.monotonic()

@@ -1,4 +1,4 @@
-"""The viewer's controls: sliders, buttons, keys and plots. Knows no simulation."""
+"""The viewer's controls: sliders, buttons, keys and plots. It does not simulate."""
 
 import threading
 from collections.abc import Callable, Sequence
@@ -13,10 +13,10 @@ from kslc_jax.policy import Policy
 from kslc_jax.viewer.session import View
 
 MARGIN = 0.5
-"""How far [m/s] the slider of vx goes backwards, and beyond the trained range."""
+"""Range of the vx slider [m/s] backwards from 0, and forwards beyond the trained range."""
 
 SIDE_MARGIN = 0.2
-"""How far [m/s] the slider of vy goes beyond the trained range."""
+"""Range of the vy slider [m/s] beyond the trained range, on each side."""
 
 RATES = {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
 
@@ -27,9 +27,9 @@ PLOT_HEIGHT = 130
 """Pixels."""
 
 STEP = np.array([0.25, 0.1, 0.2])
-"""What a key changes of vx, vy [m/s] and yaw rate [rad/s]."""
+"""Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
 
-# viser itself moves the camera with W A S D Q E and the arrow keys.
+# viser uses W A S D Q E and the arrow keys for the camera.
 WAYS = {
     "I": ("Faster", (1, 0, 0)),
     "K": ("Slower", (-1, 0, 0)),
@@ -47,10 +47,16 @@ BLUE, ORANGE, GREEN = "#2d6cdf", "#e8590c", "#2b8a3e"
 
 
 class Panel:
-    """What the user wants, and what is shown beside the picture."""
+    """Reads the user's input, and shows plots and text beside the picture."""
 
     def __init__(self, server: viser.ViserServer, names: Sequence[str], config: CommandConfig):
-        """`names` of the policies to choose from; the trained ranges come from `config`."""
+        """Builds the controls.
+
+        Args:
+          server: the viser server of the page.
+          names: of the policies that the user can choose.
+          config: gives the trained ranges of vy and of the yaw rate.
+        """
         self.paused = False
         self._gui, self._title = server.gui, TITLE
         self._reset_wanted, self._push_wanted = threading.Event(), threading.Event()
@@ -115,13 +121,13 @@ class Panel:
         return np.array([slider.value for slider in self._sliders])
 
     def take_reset(self) -> bool:
-        """Whether a reset was asked for since the last call."""
+        """True if the user asked for a reset after the last call."""
         wanted = self._reset_wanted.is_set()
         self._reset_wanted.clear()
         return wanted
 
     def take_push(self, rng: np.random.Generator) -> np.ndarray | None:
-        """[2] m/s in a random direction if a push was asked for since the last call."""
+        """A push [2] m/s in a random direction if the user asked for one after the last call."""
         if not self._push_wanted.is_set():
             return None
         self._push_wanted.clear()
@@ -129,14 +135,14 @@ class Panel:
         return self._push.value * np.array([np.cos(angle), np.sin(angle)])
 
     def title(self, factor: float, slow: bool) -> None:
-        """Says that time runs slow where it is seen even when the panel is folded up."""
+        """Shows a slow real-time factor in the title, which a folded panel shows too."""
         title = f"{TITLE}, {factor:.2f}x real time" if slow else TITLE
         if title != self._title:
             self._title = title
             self._gui.set_panel_label(title)
 
     def plot(self, recent: Sequence[View], now: float, dt: float) -> None:
-        """Draws the latest views, `dt` [s] apart up to the time `now` [s]; every second one."""
+        """Plots every second view. The views are `dt` [s] apart and end at the time `now` [s]."""
         views = recent[::-2][::-1]
         if len(views) < 2:
             return
@@ -155,12 +161,12 @@ def _bind(gui: viser.GuiApi, key: Any, label: str, action: Callable[[], None]) -
 
 
 def _scales(low: float, high: float) -> dict[str, Scale]:
-    """Seconds across, `low` to `high` upwards."""
+    """Horizontal axis in seconds, vertical axis from `low` to `high`."""
     return {"x": Scale(time=False), "y": Scale(range=(low, high))}
 
 
 def _plots(gui: viser.GuiApi) -> tuple[viser.GuiUplotHandle, viser.GuiUplotHandle]:
-    """Forward speed, and gait phase with foot contacts, over the last seconds."""
+    """Two plots of the last seconds: forward speed; gait phase with foot contacts."""
     empty = np.zeros(2)
     common: dict[str, Any] = {
         "legend": Legend(live=False),
@@ -195,7 +201,16 @@ def _plots(gui: viser.GuiApi) -> tuple[viser.GuiUplotHandle, viser.GuiUplotHandl
 def status(
     view: View, speed: float, factor: float, slow: bool, policy: Policy, paused: bool
 ) -> str:
-    """The text above the controls, Markdown; `factor` of real time is `slow` for what is asked."""
+    """The Markdown text above the controls.
+
+    Args:
+      view: the present control step.
+      speed: mean forward speed [m/s].
+      factor: real-time factor [].
+      slow: True if `factor` is below the chosen playback speed.
+      policy: the policy that acts.
+      paused: True if the simulation is paused.
+    """
     how = "**fallen**" if view.fallen else "paused" if paused else "up"
     pace = f"real-time factor {factor:.2f}"
     pace = f"**{pace}, too slow**" if slow else pace

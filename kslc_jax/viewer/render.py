@@ -18,15 +18,15 @@ LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
 
 TALL = 2.0
-"""Height that a gait strip shows at least [m]."""
+"""Least height that a gait strip shows [m]."""
 
 
 class RenderError(MissingPackage):
-    """No way to draw on this machine; the message says what to install or to set."""
+    """This machine cannot draw off screen. The message says what to install or to set."""
 
 
 def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mujoco.Renderer:
-    """An off-screen renderer; RenderError where no GL was chosen, or it does not work."""
+    """An off-screen renderer; RenderError if no GL is chosen, or if it does not work."""
     chosen = os.environ.get("MUJOCO_GL")
     if not chosen:
         raise RenderError(
@@ -43,7 +43,7 @@ def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mu
 
 
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
-    """A camera that looks at a point set by `lookat`."""
+    """A camera at `distance` [m] from the point that the caller sets as `lookat`; in degrees."""
     cam = mujoco.MjvCamera()
     cam.distance, cam.azimuth, cam.elevation = distance, azimuth, elevation
     return cam
@@ -52,7 +52,8 @@ def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> m
 def frames(
     qpos: np.ndarray, width: int = 640, height: int = 480, distance: float = 3.0
 ) -> Iterator[np.ndarray]:
-    """Pictures [height, width, 3] of a trajectory [T, 23], the camera going along at the side."""
+    """Pictures [height, width, 3] of a trajectory [T, 23]. The camera moves with the robot and
+    sees it from the side."""
     model = robot_lib.load("high").mj_model
     data, cam = mujoco.MjData(model), camera(distance)
     with _renderer(model, height, width) as renderer:
@@ -67,12 +68,19 @@ def frames(
 def gait_strip(
     qpos: np.ndarray, dt: float, interval: float = 0.25, width: int = 1800, height: int = 420
 ) -> np.ndarray:
-    """One picture: the robot every `interval` seconds on the floor grid of 1 m (paper's figure)."""
+    """One picture: the robot every `interval` seconds on a 1 m floor grid, as the paper's figure.
+
+    Args:
+      qpos: [T, 23] trajectory.
+      dt: time between two rows of `qpos` [s].
+      interval: time between two robots [s].
+      width, height: of the picture [pixels].
+    """
     model = robot_lib.load("high").mj_model
     shown = qpos[:: round(interval / dt)]
     middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
     cam = camera(0.0, elevation=-6.0)
-    # A long lens far away shows every robot from the same side; all of them have to fit in.
+    # A long lens far away shows every robot from the same side. The distance lets all fit in.
     half_height = np.tan(np.radians(LONG_LENS / 2))
     cam.distance = 0.5 * max(length * height / width, TALL) / half_height
     cam.lookat[:] = [middle, shown[:, 1].mean(), 0.8]
@@ -107,5 +115,5 @@ def _field_of_view(model: mujoco.MjModel, degrees: float) -> Generator[None]:
 
 
 def stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures of one width above each other."""
+    """One picture: the given pictures, all of one width, from top to bottom."""
     return np.concatenate(list(pictures))

@@ -1,6 +1,6 @@
-"""A robot to play with: one environment under a policy and a command that may change at any step.
+"""One environment under a policy. The command may change at any step.
 
-No window and no clock in here: `Session` steps, `Pacer` says how many steps are due.
+This module has no window and no clock: `Session` steps, and `Pacer` counts the steps that are due.
 """
 
 import functools
@@ -18,16 +18,16 @@ from kslc_jax.networks import Params
 from kslc_jax.policy import Policy
 
 FALLEN_SECONDS = 1.0
-"""How long a fallen robot lies there before it starts anew."""
+"""Time that a fallen robot lies still before the next episode starts."""
 
 
 @flax.struct.dataclass
 class View:
-    """What is shown of one control step. Feet: left, right."""
+    """The values of one control step that the viewer shows. Feet: left, right."""
 
     qpos: jax.Array  # [23]
     command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
-    velocity: jax.Array  # [3] the same, as it is; base frame
+    velocity: jax.Array  # [3] actual vx, vy [m/s], yaw rate [rad/s]; base frame
     phase: jax.Array  # [] share of the gait cycle
     contact: jax.Array  # [2] bool
     fallen: jax.Array  # [] bool
@@ -35,10 +35,10 @@ class View:
 
 @flax.struct.dataclass
 class Memory:
-    """What a session carries from step to step."""
+    """The state that a session carries from step to step."""
 
     env: env.EnvState
-    heading: jax.Array  # [] rad, kept while no yaw rate is wanted
+    heading: jax.Array  # [] rad, commanded while the commanded yaw rate is 0
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -58,7 +58,7 @@ def _advance(
     key: jax.Array,
     count: jax.Array,
 ) -> tuple[Memory, View]:
-    """One control step; the view of a step that ended in a fall is the last one before it."""
+    """One control step. After a fall the view shows the state before the step."""
     qvel = memory.env.physics.qvel.at[:2].add(push)
     pushed = memory.env.replace(physics=memory.env.physics.replace(qvel=qvel))
     before = trials.with_command(config, pushed, command, memory.heading)
@@ -84,7 +84,7 @@ def _view(config: Config, state: env.EnvState, command: jax.Array, fallen: jax.A
 
 
 class Session:
-    """A policy at play; `view` is the present."""
+    """A policy that controls one robot; `view` is the present state."""
 
     view: View
 
@@ -97,22 +97,22 @@ class Session:
         self.reset()
 
     def reset(self) -> View:
-        """A fresh episode."""
+        """Starts a new episode."""
         key = jax.random.fold_in(self._key_reset, self._resets)
         self._resets += 1
         memory, view = _reset(self._config, self.policy.curriculum, key)
-        # On a named device, like the loaded parameters: else the second step compiles once more.
+        # On a named device, like the loaded parameters. Else the second step compiles again.
         self._memory = jax.device_put(memory, jax.devices()[0])
         self._lies = 0.0
         self.view = jax.device_get(view)
         return self.view
 
     def advance(self, command: np.ndarray, push: np.ndarray | None = None) -> View:
-        """One control step; after a fall the robot lies still for a second and starts anew.
+        """Does one control step. A fallen robot lies still for a second; then an episode starts.
 
         Args:
           command: [3] vx, vy [m/s], yaw rate [rad/s], base frame.
-          push: [2] sudden change of the base's velocity, world [m/s].
+          push: [2] sudden change of the base's velocity in the world frame [m/s].
         """
         if self._lies > self.dt / 2:
             self._lies -= self.dt
@@ -134,16 +134,16 @@ class Session:
 
 
 class Pacer:
-    """Tells how many steps of `dt` [s] are due, so that simulated time follows the clock."""
+    """Counts the steps of `dt` [s] that are due, so that simulated time follows the clock."""
 
     def __init__(self, dt: float, longest: float = 0.1):
-        """A simulation that cannot keep up drops what it is behind by more than `longest` [s]."""
+        """A slow simulation falls behind the clock. It drops the lag above `longest` [s]."""
         self._dt, self._longest = dt, longest
         self._last: float | None = None
         self._owed = 0.0
 
     def due(self, now: float, rate: float) -> int:
-        """Steps to do at the clock time `now` [s], at `rate` simulated seconds per second."""
+        """Number of steps due at the clock time `now` [s], at `rate` simulated seconds a second."""
         elapsed = 0.0 if self._last is None else now - self._last
         self._last = now
         self._owed = min(self._owed + rate * elapsed, max(1.0, rate) * self._longest)
