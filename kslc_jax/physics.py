@@ -178,8 +178,8 @@ _batches_lock = threading.Lock()
 
 
 def _batch(robot: Robot, size: int, threads: int, written: frozenset[str]) -> mujoco.batch.Batch:
-    """Simulator batch of this size (cached). Every call of `_host_step` overwrites its state and the
-    model fields `written`; all other fields are the robot's."""
+    """Simulator batch of this size (cached). Every call of `_host_step` overwrites its state and
+    the model fields `written`; all other fields are the robot's."""
     key = (robot, size, threads, written)
     if key not in _batches:
         _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)

@@ -34,7 +34,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from kslc_jax import physics
+from kslc_jax import motors, physics
 from kslc_jax.config import PhysicsConfig
 from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics, model_fields
@@ -246,7 +246,7 @@ def advance(
 
     If Drake fails in a step, qpos and qvel are NaN, like those of a diverged step in MuJoCo.
     """
-    robot, motors = world.robot, world.plant.get_actuation_input_port()
+    robot, actuation = world.robot, world.plant.get_actuation_input_port()
     joint_friction = world.data.model.dof_frictionloss[6:]
     torque, forces = np.asarray(state.torque), np.zeros(len(world.feet))
     try:
@@ -256,7 +256,7 @@ def advance(
             q, dq = qpos[7:], qvel[6:]
             torque = motors.motor_torque(robot, dynamics, q, dq, target, np)
             passive = -joint_friction * np.tanh(dq / motors.FRICTION_SPEED)
-            motors.FixValue(world.plant_context, torque + passive + robot.kd * dq)
+            actuation.FixValue(world.plant_context, torque + passive + robot.kd * dq)
             if i == steps - 1:
                 forces = foot_forces(world)
             new = world.diagram.EvalUniquePeriodicDiscreteUpdate(world.context)
