@@ -67,6 +67,20 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
     )
 
 
+def link_masses(robot: Robot, dynamics: Dynamics) -> jax.Array:
+    """Mass [B, kg] of every body of the model; the world's is 0."""
+    mass = (
+        jnp.asarray(robot.mj_model.body_mass).at[robot.link_body_ids].multiply(dynamics.link_mass)
+    )
+    mass = mass.at[robot.base_body_id].add(dynamics.base_mass)
+    return mass.at[robot.hand_body_ids].add(dynamics.hand_mass)
+
+
+def total_mass(robot: Robot, dynamics: Dynamics) -> jax.Array:
+    """Mass [] of the robot with all that it carries [kg]."""
+    return jnp.sum(link_masses(robot, dynamics))
+
+
 def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> dict[str, jax.Array]:
     """New values of the mjModel fields that `dynamics` changes, by name, for both engines.
 
@@ -77,12 +91,9 @@ def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> di
     """
     model, base, links = robot.mj_model, robot.base_body_id, robot.link_body_ids
     contact_friction = 0.5 * (dynamics.friction + ground_friction)
-    nominal_mass = jnp.asarray(model.body_mass)
-    mass = nominal_mass.at[links].multiply(dynamics.link_mass)
-    mass = mass.at[base].add(dynamics.base_mass)
-    mass = mass.at[robot.hand_body_ids].add(dynamics.hand_mass)
+    mass = link_masses(robot, dynamics)
     com = jnp.asarray(model.body_ipos).at[links].add(dynamics.link_com)
-    scale = mass[1:] / nominal_mass[1:]  # body 0, the world, has no mass
+    scale = mass[1:] / model.body_mass[1:]  # body 0, the world, has no mass
     return {
         "geom_friction": jnp.asarray(model.geom_friction)
         .at[robot.foot_geom_ids, 0]

@@ -117,7 +117,7 @@ class Args:
         for name in self.conditions:
             made = changes(name)
             if self.engine == "drake" and (self.punch or "variation" in made):
-                raise ConfigError("punches, links, hands, sole and joints need --engine mujoco")
+                raise ConfigError("punches, hands, sole and joints need --engine mujoco")
 
     @property
     def conditions(self) -> tuple[str, ...]:

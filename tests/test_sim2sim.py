@@ -105,10 +105,10 @@ def test_all_runs_sixteen_perturbations_after_the_nominal_robot():
 
 
 def test_drake_runs_what_it_can():
-    """Robots whose links, hands, soles or joints differ need MuJoCo."""
+    """Robots whose hands, soles or joints differ need MuJoCo."""
     conditions = sim2sim.Args("x", engine="drake", perturb=("all",)).conditions
-    assert len(conditions) == 13 and "links=0.1" not in conditions
-    for what in ({"perturb": ("links=0.1",)}, {"punch": 100.0}):
+    assert len(conditions) == 14 and "hands=0.5" not in conditions
+    for what in ({"perturb": ("hands=0.5",)}, {"punch": 100.0}):
         with pytest.raises(ConfigError, match="need --engine mujoco"):
             sim2sim.Args("x", engine="drake", **what)
 

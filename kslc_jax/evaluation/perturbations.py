@@ -23,7 +23,7 @@ PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
     "gains": lambda factor: {"kp": (factor, factor), "kd": (factor, factor)},
     "strength": lambda factor: {"motor_strength": (factor, factor)},
     "imu": lambda angle: {"imu_offset": (angle, angle)},
-    "links": lambda share: {"variation": Variation(links=share)},
+    "links": lambda share: {"link_mass": (1.0 - share, 1.0 + share)},
     "hands": lambda kg: {"variation": Variation(hands=kg)},
     "sole": lambda metres: {"variation": Variation(sole=metres)},
     "joints": lambda most: {"variation": Variation(joints=most)},

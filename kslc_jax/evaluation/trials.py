@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import commands, env, maths, networks, observations, physics, signals
+from kslc_jax import commands, env, maths, networks, observations, physics, randomize, signals
 from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.evaluation import disturbances, schedules, variation
@@ -185,7 +185,6 @@ def _start(
 ) -> Trial:
     """One robot at rest that heads to `heading` [rad], under the command `wanted` [3] if there is
     no schedule."""
-    robot = physics.robot_for(config.physics)
     state = env.reset(config, key, curriculum)
     own, key_body = jax.random.split(jax.random.fold_in(key, 1))
     leg = schedules.constant(wanted, heading)
@@ -197,7 +196,7 @@ def _start(
         queue=jnp.zeros((setting.latency, len(state.last_action))),
         leg=leg,
         arms=state.physics.qpos[7:],
-        body=variation.sample(setting.variation, robot, key_body),
+        body=variation.sample(setting.variation, key_body),
         key=own,
         steps=jnp.zeros((), jnp.int32),
     )
@@ -240,7 +239,8 @@ def _advance(
         arms=arms,
         steps=trial.steps + 1,
     )
-    mass = variation.total_mass(setting.variation, robot, trial.body, after.dynamics.base_mass)
+    mass = randomize.total_mass(robot, after.dynamics)
+    mass += len(variation.FEET) * setting.variation.hands
     return trial, _record(robot, trial, state.command.velocity, mass)
 
 

@@ -1,5 +1,5 @@
-"""Robots that differ from the described one in more than training's ranges say: every link's mass,
-heavier hands, wandering sole contact, friction and damping of each joint.
+"""Robots that differ from the described one in what training does not draw: heavier hands, soles
+whose contact wanders, friction and damping of each joint.
 
 They change fields of the mjModel, see `physics.step`. One robot each.
 """
@@ -22,8 +22,8 @@ FEET = ("left_foot", "right_foot")
 TILT = 0.003
 """Largest tilt of a wandering sole about each horizontal axis [rad]: 2 to 4 of its corners bear."""
 
-MOST_SHARE, MOST_INSET = 0.9, 0.04
-"""Largest `links` and `sole`: links keep some mass, soles keep some area."""
+MOST_INSET = 0.04
+"""Largest `sole` [m]: soles keep some area."""
 
 Fields = dict[str, jax.Array]
 
@@ -32,8 +32,6 @@ Fields = dict[str, jax.Array]
 class Variation:
     """By how much robots differ; 0 is the described robot."""
 
-    links: float = 0.0
-    """Largest change of each link's mass and inertia, as a share of it."""
     hands: float = 0.0
     """Mass added at each hand [kg]."""
     sole: float = 0.0
@@ -46,8 +44,6 @@ class Variation:
         for name in ("hands", "joints"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"{name} must not be negative")
-        if not 0 <= self.links <= MOST_SHARE:
-            raise ConfigError(f"links must lie in [0, {MOST_SHARE}]")
         if not 0 <= self.sole <= MOST_INSET:
             raise ConfigError(f"sole must lie in [0, {MOST_INSET}] m")
 
@@ -60,20 +56,16 @@ NOMINAL = Variation()
 class Body:
     """How one robot differs."""
 
-    mass: jax.Array  # [nbody] factor on each body's mass and inertia
     friction: jax.Array  # [16] N m
     damping: jax.Array  # [16] N m s/rad
 
 
-def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:
+def sample(variation: Variation, key: jax.Array) -> Body:
     """Draws one robot."""
-    keys = jax.random.split(key, 3)
-    most = variation.links
-    share = jax.random.uniform(keys[0], (robot.mj_model.nbody,), minval=-most, maxval=most)
+    key_friction, key_damping = jax.random.split(key)
     return Body(
-        mass=1.0 + share,
-        friction=variation.joints * jax.random.uniform(keys[1], (NUM_JOINTS,)),
-        damping=variation.joints * jax.random.uniform(keys[2], (NUM_JOINTS,)),
+        friction=variation.joints * jax.random.uniform(key_friction, (NUM_JOINTS,)),
+        damping=variation.joints * jax.random.uniform(key_damping, (NUM_JOINTS,)),
     )
 
 
@@ -88,8 +80,8 @@ def alter(variation: Variation, robot: Robot, body: Body, key: jax.Array, fields
       fields: mjModel fields by name.
     """
     model = robot.mj_model
-    if variation.links or variation.hands:
-        fields = fields | _masses(variation, robot, body, fields)
+    if variation.hands:
+        fields = fields | _heavier_hands(variation.hands, robot, fields)
     if variation.joints:
         fields = fields | {
             "dof_frictionloss": jnp.asarray(model.dof_frictionloss).at[6:].add(body.friction),
@@ -100,24 +92,17 @@ def alter(variation: Variation, robot: Robot, body: Body, key: jax.Array, fields
     return fields
 
 
-def total_mass(variation: Variation, robot: Robot, body: Body, base_mass: jax.Array) -> jax.Array:
-    """Mass [kg] of the robot with `base_mass` [kg] added to its base."""
-    mass = jnp.asarray(_with_hands(robot, variation.hands)["body_mass"])
-    return jnp.sum(body.mass * mass.at[robot.base_body_id].add(base_mass))
-
-
-def _masses(variation: Variation, robot: Robot, body: Body, fields: Fields) -> Fields:
-    heavier = _with_hands(robot, variation.hands)
+def _heavier_hands(kg: float, robot: Robot, fields: Fields) -> Fields:
     hands = np.array(_hand_bodies(robot))
-    new = {
+    mass = fields["body_mass"].at[hands].add(kg)
+    placed = {
         name: fields.get(name, jnp.asarray(getattr(robot.mj_model, name)))
         .at[hands]
         .set(value[hands])
-        for name, value in heavier.items()
+        for name, value in _with_hands(robot, kg).items()
     }
-    new["body_mass"] = new["body_mass"] * body.mass
-    new["body_inertia"] = new["body_inertia"] * body.mass[:, None]
-    return new | {"body_subtreemass": jnp.asarray(_subtrees(robot)) @ new["body_mass"]}
+    subtree = jnp.sum(robot.subtree * mass, axis=1)
+    return placed | {"body_mass": mass, "body_subtreemass": subtree}
 
 
 def _hand_bodies(robot: Robot) -> list[int]:
@@ -125,25 +110,13 @@ def _hand_bodies(robot: Robot) -> list[int]:
 
 
 @functools.lru_cache(maxsize=32)
-def _subtrees(robot: Robot) -> np.ndarray:
-    """[nbody, nbody] 1 where the second body is the first one or hangs on it."""
-    parent = robot.mj_model.body_parentid
-    below = np.eye(len(parent))
-    for i in reversed(range(1, len(parent))):
-        below[parent[i]] += below[i]
-    return below
-
-
-@functools.lru_cache(maxsize=32)
 def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
-    """Mass, centre, inertia and principal axes of all bodies, with point masses at the hands."""
+    """Centre, inertia and principal axes of all bodies, with point masses at the hands."""
     model = robot.mj_model
-    names = ("body_mass", "body_ipos", "body_inertia", "body_iquat")
+    names = ("body_ipos", "body_inertia", "body_iquat")
     out = {name: getattr(model, name).copy() for name in names}
-    if kg == 0:
-        return out
     for i, side in zip(_hand_bodies(robot), ("left", "right"), strict=True):
-        mass, centre = out["body_mass"][i], out["body_ipos"][i]
+        mass, centre = model.body_mass[i], out["body_ipos"][i]
         arm = model.geom(f"{side}_hand").pos - centre
         axes = np.empty(9)
         mujoco.mju_quat2Mat(axes, model.body_iquat[i])
@@ -153,7 +126,6 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
         spread = reduced * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         inertia, axes = np.linalg.eigh(axes @ np.diag(out["body_inertia"][i]) @ axes.T + spread)
         axes[:, 2] = np.cross(axes[:, 0], axes[:, 1])  # a rotation, not a reflection
-        out["body_mass"][i] = mass + kg
         out["body_ipos"][i] = centre + arm * kg / (mass + kg)
         out["body_inertia"][i] = inertia
         mujoco.mju_mat2Quat(out["body_iquat"][i], axes.flatten())
