@@ -16,7 +16,6 @@ TINY = {
     '"laptop"': '"debug"',
     "--preset laptop": "--preset debug",
     "--env.num-envs 4096 --ppo.minibatches 8": "--env.num-envs 32 --ppo.minibatches 4",
-    "--start-from xbot_l_run": "--start-from runs/laptop-seed0",
     "--steps 80000000": "--steps 2048",
     "--speeds 1 2 --seeds 8 --seconds 20": "--speeds 1 --seeds 1 --seconds 3",
     "--seconds 10": "--seconds 1",
