@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from kslc_jax import compare, config, plots
+from kslc_jax import compare, config, files, plots
 
 
 def test_every_variant_and_seed_is_a_job(tmp_path):
@@ -51,11 +51,11 @@ def finished_run(folder, survival=1.0):
     (folder / "config.json").write_text(json.dumps(config.to_dict(laptop)))
     (folder / "versions.json").write_text(json.dumps({"git": "0123abc"}))
     row = {"command": 1.0, "forward_mean": 0.97, "survival": survival}
-    (folder / compare.EVALUATION).write_text(
+    (folder / files.EVALUATION).write_text(
         json.dumps({"fidelity": "high", "seeds": 8, "rows": [row]})
     )
     point = {"env_steps": 2500000, "rows": [row | {"forward_mean": 2 / 3, "forward_std": 0.1}]}
-    (folder / compare.LEARNING).write_text(json.dumps({"run": folder.name, "points": [point]}))
+    (folder / files.LEARNING).write_text(json.dumps({"run": folder.name, "points": [point]}))
     records = [
         dict.fromkeys(plots.COLUMNS, 1 / 3)
         | {"env_steps": 1e5 * i, "seconds": 10.0 * i, "curriculum/v_max": 0.5 + (i >= 14)}
@@ -109,7 +109,7 @@ def test_an_answer_to_another_question_does_not_count(tmp_path, called, other, a
     argv = ["--out", str(tmp_path), *ASKED, "--seeds", "0"]
     assert compare.main(argv) == 0
     assert compare.main([*argv, *other]) == 1 and called == [again]
-    assert (run / compare.EVALUATION).exists() == (again == "evaluate")
+    assert (run / files.EVALUATION).exists() == (again == "evaluate")
 
 
 @pytest.mark.parametrize("steps", ["2500000", "2500001"], ids=["finished", "to go on with"])
@@ -126,7 +126,7 @@ def test_a_run_of_another_config_is_named_and_left_alone(tmp_path, called, capsy
     assert first.startswith(f"error: {folder} is not of this comparison: ")
     assert last == "error: left alone: kslc-seed0; name another --out"
     assert out.out == "" and list((tmp_path / "kept").iterdir()) == []
-    assert (folder / compare.EVALUATION).exists()
+    assert (folder / files.EVALUATION).exists()
 
 
 def test_a_run_that_trains_on_is_not_done_by_its_old_evaluation(tmp_path, called):
@@ -176,7 +176,7 @@ def test_what_is_kept_draws_the_same_figures(tmp_path):
     assert list(short["episode_steps"]) == [0.33333] * 5
     (curve,) = plots.read_learning([kept / run.name])["kslc"]
     assert curve.reached == [[0.66667]] and curve.env_steps == [2500000]
-    for name in ("config.json", "versions.json", compare.EVALUATION):
+    for name in ("config.json", "versions.json", files.EVALUATION):
         assert (kept / run.name / name).read_text() == (run / name).read_text()
 
 
@@ -196,7 +196,7 @@ def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
     job = next(compare.jobs(compare.Args(out=tmp_path, variants=("kslc",))))
     finished_run(job.folder)
     folder = str(job.folder)
-    (job.folder / compare.LEARNING).unlink()
+    (job.folder / files.LEARNING).unlink()
     assert compare.run(job, 2_500_000)
     assert called == [("train", "--preset"), ("learning", folder), ("evaluate", folder)]
     called.clear()
