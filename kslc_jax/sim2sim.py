@@ -184,14 +184,18 @@ def _rows(args: Args, policy, condition: str, progress) -> list[dict[str, Any]]:
 
 def summary(results: Results, title: str):
     """Survival and mean speed of every condition and commanded speed, as a rich table."""
+    from rich.markup import escape
     from rich.table import Table
 
     out = Table(title=title, title_justify="left")
-    out.add_column("survived, mean vx [m/s]")
+    out.add_column(escape("survived, mean vx [m/s]"))
     for row in results["nominal"]:
         out.add_column(f"{row['command']:.1f}", justify="right")
     for condition, rows in results.items():
-        cells = [f"{row['survival']:.0%} {row['forward_mean']:.2f}" for row in rows]
+        cells = [
+            f"{row['survival']:.0%} {row['forward_mean']:.2f}" + "*" * ("beyond" in row)
+            for row in rows
+        ]
         out.add_row(condition, *cells)
     return out
 
