@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
@@ -203,11 +204,14 @@ def _rows(
 def summary(results: Results, title: str) -> Table:
     """Survival and mean speed of every condition and commanded speed."""
     out = Table(title=title, title_justify="left")
-    out.add_column("survived, mean vx [m/s]")
+    out.add_column(escape("survived, mean vx [m/s]"))
     for row in results["nominal"]:
         out.add_column(f"{row['command']:.1f}", justify="right")
     for condition, rows in results.items():
-        cells = [f"{row['survival']:.0%} {row['forward_mean']:.2f}" for row in rows]
+        cells = [
+            f"{row['survival']:.0%} {row['forward_mean']:.2f}" + "*" * ("beyond" in row)
+            for row in rows
+        ]
         out.add_row(condition, *cells)
     return out
 
