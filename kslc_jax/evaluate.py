@@ -86,7 +86,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _report(args: Args) -> None:
     """Tries the policy, prints the table, keeps the numbers."""
-    from kslc_jax.policy import load_policy
+    from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
@@ -97,7 +97,7 @@ def _report(args: Args) -> None:
     title = f"{args.policy}, train step {policy.step}, {args.fidelity} fidelity"
     screen.print(table(rows, title))
     if args.json is not None:
-        what = {"policy": str(args.policy), "step": policy.step}
+        what = {"policy": policy_name(args.policy), "step": policy.step}
         how = {n: getattr(args, n) for n in ("fidelity", "seeds", "seconds", "noise", "seed")}
         files.write_json(args.json, {**what, **how, "rows": rows})
 

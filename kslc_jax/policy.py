@@ -105,9 +105,26 @@ def save_policy(policy: Policy, folder: Path) -> None:
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
         try:
             writer.save(folder.resolve(), args=ocp.args.Composite(**items))
+            _forget_where(folder)
         except (OSError, ValueError) as error:
             clear_away(folder.parent)
             raise CheckpointError(f"cannot write {folder}: {first_line(error)}") from error
+
+
+def _forget_where(folder: Path) -> None:
+    """Takes the absolute path out of orbax's notes in a stored policy; only their presence counts,
+    and policies are passed on to others."""
+    for note in folder.rglob("commit_success.txt"):
+        note.write_text("Checkpoint commit was successful\n")
+
+
+def policy_name(path_or_name: str | Path) -> str:
+    """The name of a run, of a stored policy or of a shipped one, for results that others read:
+    without the folders of this machine. A checkpoint has the name of its run."""
+    path = Path(path_or_name).resolve()
+    if path.name.isdigit() and path.parent.name in (files.CHECKPOINTS, files.SNAPSHOTS):
+        path = path.parent
+    return path.parent.name if path.name in (files.CHECKPOINTS, files.SNAPSHOTS) else path.name
 
 
 def checkpoint_folder(path: Path) -> Path:

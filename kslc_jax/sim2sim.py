@@ -209,7 +209,7 @@ def main(argv: list[str] | None = None) -> int:
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, keeps the numbers."""
     simulator(args.engine)  # what is not installed is told before anything is loaded
-    from kslc_jax.policy import load_policy
+    from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
@@ -233,7 +233,7 @@ def _report(args: Args) -> None:
     if len(results) > 1:
         screen.print(summary(results, title))
     if args.json is not None:
-        what = {"policy": str(args.policy), "step": policy.step}
+        what = {"policy": policy_name(args.policy), "step": policy.step}
         names = ("engine", "sideways", "turn", "seeds", "seconds", "noise", "latency", "seed")
         how = {name: getattr(args, name) for name in names}
         files.write_json(args.json, {**what, **how, "conditions": results})

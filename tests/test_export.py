@@ -199,6 +199,12 @@ def saved(symmetric, tmp_path_factory):
     return folder
 
 
+def test_a_stored_policy_names_no_folder(saved):
+    paths = [path for path in saved.rglob("*") if path.is_file()]
+    assert len(paths) > 5
+    assert not [path for path in paths if str(saved.parent).encode() in path.read_bytes()]
+
+
 def test_a_policy_folder_is_the_whole_policy(symmetric, saved):
     back = policy_lib.load_policy(saved)
     assert back.config == symmetric.config and back.step == symmetric.step
