@@ -1,6 +1,6 @@
-"""A robot to play with: one environment under a policy and a command that may change at any step.
+"""An interactive session: one environment under a policy and a command that may change at any step.
 
-No window and no clock in here: `Session` steps, `Pacer` says how many steps are due.
+This module has no window and no clock. `Session` steps; `Pacer` says how many steps are due.
 """
 
 import functools
@@ -18,16 +18,37 @@ from kslc_jax.networks import Params
 from kslc_jax.policy import Policy
 
 FALLEN_SECONDS = 1.0
-"""How long a fallen robot lies there before it starts anew."""
+"""Time [s] for which a fallen robot lies before it starts anew."""
+
+EPSILON = 1e-5
+"""Share by which the slowest command lies above the dead zone, in float32."""
+
+
+STOP = 0.9
+"""Share of the dead zone below which a walking robot stops."""
+
+
+def steady(velocity: np.ndarray, walks: bool, dead_zone: float) -> tuple[np.ndarray, bool]:
+    """A command [3] that does not start and stop the robot at each trembling of a joystick at the
+    edge of the dead zone [m/s], and True if the robot is to walk.
+
+    Walking begins above the dead zone and ends below `STOP` of it. In between a walking robot is
+    asked for the edge, the slowest command of the training.
+    """
+    speed = float(np.hypot(*velocity[:2]))
+    if not speed > dead_zone * (STOP if walks else 1.0):
+        return velocity, False
+    edge = dead_zone * (1.0 + EPSILON)
+    return velocity * np.array([*2 * [max(edge / speed, 1.0)], 1.0]), True
 
 
 @flax.struct.dataclass
 class View:
-    """What is shown of one control step. Feet: left, right."""
+    """The state after one control step, for display. Feet: left, right."""
 
     qpos: jax.Array  # [23]
     command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
-    velocity: jax.Array  # [3] the same, as it is; base frame
+    velocity: jax.Array  # [3] the actual velocity, same units; base frame
     phase: jax.Array  # [] share of the gait cycle
     contact: jax.Array  # [2] bool
     fallen: jax.Array  # [] bool
@@ -35,7 +56,7 @@ class View:
 
 @flax.struct.dataclass
 class Memory:
-    """What a session carries from step to step."""
+    """State of a session between control steps."""
 
     env: env.EnvState
     heading: jax.Array  # [] rad, kept while no yaw rate is wanted
@@ -84,7 +105,7 @@ def _view(config: Config, state: env.EnvState, command: jax.Array, fallen: jax.A
 
 
 class Session:
-    """A policy at play; `view` is the present."""
+    """One robot under a policy; `view` is its present state."""
 
     view: View
 
@@ -103,7 +124,7 @@ class Session:
         memory, view = _reset(self._config, self.policy.curriculum, key)
         # On a named device, like the loaded parameters: else the second step compiles once more.
         self._memory = jax.device_put(memory, jax.devices()[0])
-        self._lies = 0.0
+        self._lies, self._walks = 0.0, False
         self.view = jax.device_get(view)
         return self.view
 
@@ -117,6 +138,8 @@ class Session:
         if self._lies > self.dt / 2:
             self._lies -= self.dt
             return self.view
+        dead_zone = self._config.command.dead_zone
+        command, self._walks = steady(np.asarray(command), self._walks, dead_zone)
         self._memory, view = _advance(
             self._config,
             self.policy.params,
@@ -137,13 +160,13 @@ class Pacer:
     """Tells how many steps of `dt` [s] are due, so that simulated time follows the clock."""
 
     def __init__(self, dt: float, longest: float = 0.1):
-        """A simulation that cannot keep up drops what it is behind by more than `longest` [s]."""
+        """A simulation that is too slow drops its delay beyond `longest` [s]."""
         self._dt, self._longest = dt, longest
         self._last: float | None = None
         self._owed = 0.0
 
     def due(self, now: float, rate: float) -> int:
-        """Steps to do at the clock time `now` [s], at `rate` simulated seconds per second."""
+        """Steps that are due at the time `now` [s], at `rate` simulated seconds per second."""
         elapsed = 0.0 if self._last is None else now - self._last
         self._last = now
         self._owed = min(self._owed + rate * elapsed, max(1.0, rate) * self._longest)
