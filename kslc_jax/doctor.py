@@ -148,9 +148,11 @@ def check_cache() -> str:
 
 
 def check_cores() -> str:
-    """How many of the machine's cores this process may use."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{usable} of {os.cpu_count()} usable"
+    """Cores that this process may use, of all that the machine has, and what limits them."""
+    usable, there = runtime.usable_cpus(), os.cpu_count() or 1
+    if usable >= there:
+        return f"{usable} of {there}"
+    return f"{usable} of {there} ({'quota' if usable < runtime.affine_cpus() else 'affinity'})"
 
 
 CHECKS: tuple[tuple[str, Callable[[], str], str], ...] = (

@@ -27,6 +27,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # mjx prints about an optional 
     from mujoco import mjx
 
 from kslc_jax import robot as robot_lib
+from kslc_jax import runtime
 from kslc_jax.config import PhysicsConfig
 from kslc_jax.motors import SERVO_DAMPING, drive
 from kslc_jax.randomize import Dynamics, model_fields
@@ -82,7 +83,10 @@ def step(
     dynamics: Dynamics,
     ground_friction: float,
 ) -> PhysicsState:
-    """Advances one environment by one control step towards the joint targets [16, rad]."""
+    """Advances one environment by one control step towards the joint targets [16, rad].
+
+    The new state has the dtypes of the old one, also in a program that enables x64.
+    """
     fields = model_fields(robot_for(config), dynamics, ground_friction)
     engine = _step_mujoco if resolve_engine(config) == "mujoco" else _step_mjx
     return engine(config, state, target, dynamics, fields)
@@ -123,8 +127,11 @@ def _step_mjx(
 ) -> PhysicsState:
     robot = robot_for(config)
     model = _mjx_model(config).replace(**fields)
-    data = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax").replace(
-        qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
+    blank = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax")
+    data = blank.replace(
+        qpos=state.qpos.astype(blank.qpos.dtype),  # under x64 the state need not be float64
+        qvel=state.qvel.astype(blank.qvel.dtype),
+        qacc_warmstart=state.qacc_warmstart.astype(blank.qacc_warmstart.dtype),
     )
 
     def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
@@ -135,13 +142,14 @@ def _step_mjx(
     with jax.default_matmul_precision("highest"):
         data, torques = jax.lax.scan(substep, data, None, length=config.decimation)
         data = _refresh_sensors(model, data)
-    return PhysicsState(
+    new = PhysicsState(
         qpos=data.qpos,
         qvel=data.qvel,
         qacc_warmstart=data.qacc_warmstart,
         sensordata=data.sensordata,
         torque=torques[-1],
     )
+    return jax.tree.map(lambda x, old: x.astype(old.dtype), new, state)
 
 
 def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -158,10 +166,14 @@ _batches_lock = threading.Lock()
 
 
 def _batch(robot: Robot, size: int, threads: int) -> mujoco.batch.Batch:
-    """The cached simulator batch of this size; its state is overwritten at every call."""
+    """The cached simulator batch of this size; its state is overwritten at every call.
+
+    MuJoCo's own default, 0 threads, would start one for every CPU of the machine.
+    """
     key = (robot, size, threads)
     if key not in _batches:
-        _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
+        count = threads or runtime.usable_cpus()
+        _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=count)
     return _batches[key]
 
 
@@ -191,7 +203,10 @@ def _host_step(
     dynamics: Dynamics,
     fields: dict[str, np.ndarray],
 ) -> PhysicsState:
-    """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us."""
+    """numpy in, numpy out: no JAX call in here, it would wait for the program that waits for us.
+
+    The result has the dtypes of `state`.
+    """
     lead = np.shape(target)[:-1]
     robot = robot_for(config)
 
@@ -199,6 +214,7 @@ def _host_step(
         x = np.asarray(x, np.float64)
         return x.reshape(-1, *x.shape[len(lead) :])
 
+    like = state
     state, dynamics, fields = jax.tree.map(rows, (state, dynamics, fields))
     target = rows(target)
     with _batches_lock:
@@ -223,4 +239,6 @@ def _host_step(
             sensordata=sensordata,
             torque=torque,
         )
-        return jax.tree.map(lambda x: np.array(x, np.float32).reshape(*lead, *x.shape[1:]), new)
+        return jax.tree.map(
+            lambda x, old: np.array(x, old.dtype).reshape(*lead, *x.shape[1:]), new, like
+        )
