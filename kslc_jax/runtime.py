@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from kslc_jax.errors import UserError
 
@@ -171,7 +172,7 @@ def quiet() -> None:
     for name in ("absl", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     sys.excepthook, sys.unraisablehook = _excepthook, _unraisablehook
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
+    warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
 
 
 def _excepthook(
@@ -184,6 +185,11 @@ def _excepthook(
 def _unraisablehook(args: "sys.UnraisableHookArgs") -> None:
     if not inspect.iscoroutine(args.object):
         sys.__unraisablehook__(args)
+
+
+def _one_line(message: Warning | str, *_: Any, **__: Any) -> str:
+    """A Python warning without the source line that raised it."""
+    return f"warning: {message}\n"
 
 
 def first_line(error: Exception) -> str:
