@@ -624,6 +624,14 @@ class TestChangedRobot:
             policy_lib.save_policy(policy, tmp_path / "copy")
             assert policy_lib.load_policy(tmp_path / "copy").robot is None
 
+    def test_a_shipped_policy_knows_its_robot(self, edit_robot):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            policy_lib.load_policy("xbot_l_run")
+        edit_robot('kp="350"', 'kp="700"')
+        with pytest.warns(UserWarning, match=r"^xbot_l_run: .*kp of left_\w+ 350 -> 700"):
+            policy_lib.load_policy("xbot_l_run")
+
     def test_both_fidelities_count(self, edit_robot):
         """Joint friction acts at high fidelity only."""
         before = fingerprint.fingerprint()
