@@ -50,6 +50,8 @@ NUMERICS: dict[str, str | bool | int | None] = {
 """JAX's options that change numbers, or that stop at a NaN which this package masks, with the
 values that all commands use: JAX's defaults."""
 
+_YES, _NO = ("1", "true", "t", "yes", "y", "on"), ("0", "false", "f", "no", "n", "off")
+
 XLA_THREADS = "PJRT_NPROC"
 """Variable that tells XLA how many threads to start on a CPU. By itself XLA knows the affinity, but
 no quota."""
@@ -75,7 +77,7 @@ def prepare(gl: bool = True) -> None:
     if usable_cpus() < affine_cpus():
         os.environ.setdefault(XLA_THREADS, str(usable_cpus()))
     if others := fix_numerics():
-        print(f"warning: {', '.join(others)} is ignored: it would change numbers", file=sys.stderr)
+        print(f"warning: {', '.join(others)} ignored: numbers would change", file=sys.stderr)
     if gl:
         choose_gl()
 
@@ -90,7 +92,7 @@ def fix_numerics() -> list[str]:
             found[name.upper()] = text
         if "jax" in sys.modules:
             options = sys.modules["jax"].config
-            value = getattr(options, name)
+            value = getattr(options, name, ours)  # a JAX may have dropped an option
             if value != ours:
                 found.setdefault(name.upper(), str(value))
                 options.update(name, ours)
@@ -100,11 +102,8 @@ def fix_numerics() -> list[str]:
 def _means(text: str, value: str | bool | int | None) -> bool:
     """True if JAX reads `text` in the environment as `value`."""
     if isinstance(value, bool):
-        return text.lower() in (("1", "true", "t", "yes", "y", "on") if value else _FALSE)
+        return text.lower() in (_YES if value else _NO)
     return text == str(value)
-
-
-_FALSE = ("0", "false", "f", "no", "n", "off")
 
 
 def affine_cpus() -> int:
