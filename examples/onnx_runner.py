@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 import onnxruntime
 
+STOP = 0.9  # share of the dead zone below which a walking robot stops
+
 
 class Controller:
     """Computes joint targets from measurements, once per control step; keeps clock and history."""
@@ -23,11 +25,19 @@ class Controller:
             raise SystemExit(f"error: {path} has no metadata of version 3, see docs/export.md")
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
-        walks = np.hypot(vx, vy) > m.command.dead_zone
-        self.velocity, self.heading, self.phase = walks * np.array([vx, vy]), heading, 0.0
+        self.velocity, self.phase = np.zeros(2), 0.0
+        self.command(vx, vy, heading)
         self.free = np.array([name not in m.held_joints for name in m.joint_names])
         self.action = np.zeros(len(m.joint_names))
         self.history = np.zeros((m.history_length, sum(c.width for c in m.frame)), np.float32)
+
+    def command(self, vx, vy=0.0, heading=0.0):
+        """A new command [m/s, rad]. Walking begins above the dead zone and ends below 0.9 of it, so
+        that a joystick that trembles there does not start and stop the robot."""
+        speed, edge = np.hypot(vx, vy), self.meta.command.dead_zone
+        walks = speed > (STOP if self.velocity.any() else 1) * edge
+        self.velocity = np.array([vx, vy]) * max(edge / speed, 1) if walks else np.zeros(2)
+        self.heading = heading
 
     def frame(self, quat, angvel, joint_pos, joint_vel):
         """The observation frame of one control step.
@@ -59,13 +69,16 @@ class Controller:
         share = min(speed / gait.v_max, 1) if gait.cycle_follows_speed else 1
         return gait.base_cycle_time + share * (gait.cycle_time - gait.base_cycle_time)
 
-    def targets(self, *measured):
-        """Joint targets [rad] until the next control step. It advances clock and history."""
+    def targets(self, *measured, dt=None):
+        """Joint targets [rad] until the next control step. It advances clock and history. `dt` is
+        the measured time until then [s]; without it, the policy's own control step."""
         m, gait = self.meta, self.meta.gait
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
         action = np.array(self.network.run(["action"], {"history": self.history[None]})[0])[0]
         self.action = np.clip(action, -m.action_clip, m.action_clip) * self.free
-        self.phase = (self.phase + m.control_dt / self.cycle(gait, abs(self.velocity[0]))) % 1
+        self.phase = (
+            self.phase + (dt or m.control_dt) / self.cycle(gait, abs(self.velocity[0]))
+        ) % 1
         return m.default_joint_pos + m.action_scale * self.action
 
 
@@ -77,17 +90,28 @@ def motor_torque(m, target, q, dq):
     return np.clip(m.kp * (target - q) - m.kd * dq, -lower, upper)
 
 
+def steps_per_control(control_dt, timestep):
+    """Physics steps in a control step; an error where they do not fill it."""
+    steps = max(1, round(control_dt / timestep))
+    if abs(steps * timestep - control_dt) > 1e-6 * control_dt:
+        raise SystemExit(
+            f"error: timestep {timestep:g} s does not divide the control step, {control_dt:g} s"
+        )
+    return steps
+
+
 def simulate(controller, model, seconds):
     """Base positions [T, 3] at each control step, until the time is over or the robot falls."""
     m, data = controller.meta, mujoco.MjData(model)
+    steps = steps_per_control(m.control_dt, model.opt.timestep)
     quat, angvel, q, dq = data.qpos[3:7], data.qvel[3:6], data.qpos[7:], data.qvel[6:]  # views
     q[:], track = m.default_joint_pos, [data.qpos[:3].copy()]
     model.actuator_forcelimited[:] = 0  # motor_torque limits the torque
     damping = 0.6 * np.array(m.kd)  # integrated implicitly, as in the package away from the limits
     model.actuator_biasprm[:, 2] = -damping
     while len(track) <= round(seconds / m.control_dt) and track[-1][2] > track[0][2] / 2:
-        target = controller.targets(quat, angvel, q, dq)
-        for _ in range(round(m.control_dt / model.opt.timestep)):
+        target = controller.targets(quat, angvel, q, dq, dt=steps * model.opt.timestep)
+        for _ in range(steps):
             torque = motor_torque(m, target, q, dq)
             data.ctrl = q + (torque + damping * dq) / m.kp  # servos: kp (ctrl - q) - damping dq
             mujoco.mj_step(model, data)

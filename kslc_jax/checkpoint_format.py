@@ -5,7 +5,7 @@ A checkpoint holds four orbax items, each usable without the others:
 - ``params``  the networks, all that a policy needs: the actor as it is used, averaged;
 - ``core``    the actor as it is trained, optimiser, learning rate, curriculum, key and step;
 - ``env``     the environments; with it a resumed run equals an uninterrupted one bit for bit;
-- ``meta``    JSON: schema version, config, metrics of that step, checksums.
+- ``meta``    JSON: schema version, robot and its numbers, config, metrics of that step, checksums.
 
 Nothing is ever unpickled: arrays are raw numbers, everything else is JSON.
 """
@@ -26,6 +26,7 @@ from kslc_jax import files
 from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config
 from kslc_jax.errors import UserError
+from kslc_jax.fingerprint import Fingerprint, changes, fingerprint
 
 SCHEMA_VERSION = 3
 """Of a checkpoint's items; raise it with every change of the tree of `TrainState`, and say below
@@ -36,12 +37,16 @@ OLDER_POLICIES = (1, 2)
 of the actor, no time of the next command, no sums of the curriculum's top."""
 
 
+ROBOT_NUMBERS = "robot_numbers"
+"""Entry of a meta item: the `fingerprint` of the robot. Older checkpoints have none."""
+
+
 class CheckpointError(UserError):
     """A checkpoint that is missing, damaged or of another config; the message says which."""
 
 
 def is_key(x: Any) -> bool:
-    """Whether an array, or its shape, is one of typed random keys."""
+    """True if an array, or its shape, is one of typed random keys."""
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
@@ -51,12 +56,12 @@ def host_array(x: jax.Array) -> np.ndarray:
 
 
 def typed(numbers: np.ndarray, like: Any) -> Any:
-    """An array on the host as what `host_array` made it of: key data become keys again."""
+    """Inverse of `host_array`: key data become keys again, as in `like`."""
     return jax.random.wrap_key_data(jnp.asarray(numbers)) if is_key(like) else numbers
 
 
 def checksum(tree: Any) -> int:
-    """CRC-32 of all numbers of a tree: orbax itself reads flipped bits without a word."""
+    """CRC-32 of all numbers of a tree. Orbax itself does not notice flipped bits."""
     crc = 0
     for leaf in jax.tree.leaves(tree):
         crc = zlib.crc32(host_array(leaf).tobytes(), crc)
@@ -64,8 +69,8 @@ def checksum(tree: Any) -> int:
 
 
 def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
-    """The meta item, if it is as it was written, of this robot and of a schema that is read, for
-    going on with the `whole` training or for the policy alone; CheckpointError if not."""
+    """Returns the meta item. CheckpointError if it is damaged, of another robot, or of a schema
+    that cannot be read: for resuming the `whole` training, or for the policy alone."""
     schema = meta.get("schema", 1)
     if schema in OLDER_POLICIES and whole:
         raise CheckpointError(
@@ -85,26 +90,40 @@ def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
     return meta
 
 
+def changed_robot(numbers: Fingerprint | None) -> str:
+    """The numbers in which the robot now differs from a stored one, in one line; empty if in none,
+    or if it was not stored."""
+    return changes(numbers, fingerprint()) if numbers else ""
+
+
 def _robot() -> dict[str, Any]:
-    """What a policy's actions mean: the robot's name and the order of its joints."""
+    """The robot's name and the order of its joints, which give a policy's actions their meaning."""
     robot = robot_lib.load()
     return {"name": robot.name, "joints": list(robot.joint_names)}
 
 
-def metadata(config: Config, metrics: dict[str, float], parts: dict[str, Any]) -> dict[str, Any]:
-    """The meta item that goes with the other items of a checkpoint."""
+def metadata(
+    config: Config,
+    metrics: dict[str, float],
+    parts: dict[str, Any],
+    numbers: Fingerprint | None = None,
+) -> dict[str, Any]:
+    """The meta item that goes with the other items of a checkpoint; `numbers` are those of the
+    robot that was trained, None if unknown."""
     meta = {
         "schema": SCHEMA_VERSION,
         "robot": _robot(),
         "config": config_lib.to_dict(config),
         "metrics": metrics,
     }
+    if numbers:
+        meta[ROBOT_NUMBERS] = numbers
     sums = {name: checksum(part) for name, part in parts.items()}
     return {**meta, "checksums": {**sums, "meta": zlib.crc32(_text(meta))}}
 
 
 def _text(meta: dict[str, Any]) -> bytes:
-    """What the checksum of a meta item is taken over: all of it but the checksums."""
+    """The part of a meta item that its checksum covers: everything but the checksums."""
     return json.dumps({k: v for k, v in meta.items() if k != "checksums"}, sort_keys=True).encode()
 
 
@@ -121,7 +140,7 @@ def abstract(tree: Any) -> Any:
 
 
 def clear_away(folder: Path) -> None:
-    """Removes what failed saves left in a folder; their threads may go on writing for a moment."""
+    """Removes the remains of failed saves in a folder; their threads may still write a moment."""
     for _ in range(10):
         for path in folder.glob("*.orbax-checkpoint-tmp*"):
             shutil.rmtree(path, ignore_errors=True)
@@ -129,7 +148,7 @@ def clear_away(folder: Path) -> None:
 
 
 def has_checkpoints(run_dir: Path) -> bool:
-    """Whether there is anything in a run folder to go on from."""
+    """True if a run folder holds a checkpoint to resume from."""
     folder = run_dir / files.CHECKPOINTS
     return folder.is_dir() and bool(whole_checkpoints(folder))
 

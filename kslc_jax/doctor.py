@@ -1,4 +1,4 @@
-"""Is this machine fit to train on, and where did a training go wrong?
+"""Checks this machine, and replays a failed training.
 
 python -m kslc_jax.doctor checks versions, devices, both physics engines against each other, the
 renderer, disk, cache and cores, and says how to fix what fails; exit code 1 if something does.
@@ -59,14 +59,14 @@ class Replay:
 
 
 def check_python() -> str:
-    """Version within the tested range."""
+    """The version, if it lies within the tested range."""
     if not PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]:
         raise RuntimeError(f"Python {platform.python_version()} is not tested")
     return platform.python_version()
 
 
 def check_jax() -> str:
-    """Not one of the versions that hang."""
+    """The version, unless it is one that hangs."""
     import jax
 
     runtime.require_good_jax()
@@ -74,7 +74,7 @@ def check_jax() -> str:
 
 
 def check_devices() -> str:
-    """JAX uses the accelerator if there is one."""
+    """JAX's devices; an accelerator must be among them if there is one."""
     import jax
 
     if runtime.idle_gpu():
@@ -83,7 +83,7 @@ def check_devices() -> str:
 
 
 def check_engines() -> str:
-    """C MuJoCo and MJX give the same motion."""
+    """The engines' versions, and the distance between their motions."""
     import numpy as np
 
     a, b = _joint_angles("mujoco"), _joint_angles("mjx")
@@ -117,7 +117,7 @@ def _joint_angles(engine: Literal["mujoco", "mjx"]):
 
 
 def check_renderer() -> str:
-    """A picture can be drawn; in a process of its own, for GL is chosen before mujoco starts."""
+    """Draws a picture. It takes a process of its own, because GL is chosen before mujoco starts."""
     code = (
         "from kslc_jax import runtime; runtime.prepare();"
         "from kslc_jax import robot; from kslc_jax.viewer import render; import os;"
@@ -132,7 +132,7 @@ def check_renderer() -> str:
 
 
 def check_disk() -> str:
-    """Room for run folders."""
+    """Free space for run folders."""
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     if free < FREE_DISK:
         raise RuntimeError(f"{free:.1f} GiB free in {Path.cwd()}")
@@ -140,7 +140,7 @@ def check_disk() -> str:
 
 
 def check_cache() -> str:
-    """The compilation cache can be written."""
+    """The folder of the compilation cache, if it can be written."""
     folder = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or runtime.cache_dir())
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
@@ -148,9 +148,11 @@ def check_cache() -> str:
 
 
 def check_cores() -> str:
-    """How many of the machine's cores this process may use."""
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{usable} of {os.cpu_count()} usable"
+    """Cores that this process may use, of all that the machine has, and what limits them."""
+    usable, there = runtime.usable_cpus(), os.cpu_count() or 1
+    if usable >= there:
+        return f"{usable} of {there}"
+    return f"{usable} of {there} ({'quota' if usable < runtime.affine_cpus() else 'affinity'})"
 
 
 CHECKS: tuple[tuple[str, Callable[[], str], str], ...] = (

@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
 SHORTEST = 3.0
-"""Seconds below which nothing is left of a trial after the time to gather speed."""
+"""Shortest trial [s]: some time must remain after the robot has gathered speed."""
 
 LONGEST = 86_400.0
-"""A day."""
+"""Longest trial [s]: a day."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to try."""
+    """The trials to run."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
@@ -50,7 +50,7 @@ class Args:
     seed: int = 0
     """Of initial states."""
     json: Path | None = None
-    """Where to keep the numbers."""
+    """JSON file to write the numbers to."""
 
     def __post_init__(self):
         check(self.speeds, self.seeds, self.seconds)
@@ -58,7 +58,7 @@ class Args:
 
 
 def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
-    """ConfigError where there is nothing to try or to measure."""
+    """Raises ConfigError if there is nothing to try or to measure."""
     if not (speeds and all(map(math.isfinite, speeds))):
         raise ConfigError("speeds: name at least one, finite")
     if seeds <= 0:
@@ -85,8 +85,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _report(args: Args) -> None:
-    """Tries the policy, prints the table, keeps the numbers."""
-    from kslc_jax.policy import load_policy
+    """Tries the policy, prints the table, writes the numbers."""
+    from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
@@ -97,7 +97,7 @@ def _report(args: Args) -> None:
     title = f"{args.policy}, train step {policy.step}, {args.fidelity} fidelity"
     screen.print(table(rows, title))
     if args.json is not None:
-        what = {"policy": str(args.policy), "step": policy.step}
+        what = {"policy": policy_name(args.policy), "step": policy.step}
         how = {n: getattr(args, n) for n in ("fidelity", "seeds", "seconds", "noise", "seed")}
         files.write_json(args.json, {**what, **how, "rows": rows})
 

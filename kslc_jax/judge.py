@@ -202,12 +202,12 @@ def _report(args: Args) -> None:
     from rich.progress import Progress
 
     from kslc_jax import sim2sim
-    from kslc_jax.policy import load_policy
+    from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     sim2sim.simulator("drake" if args.drake else "mujoco")
     policy = load_policy(args.policy)
-    about: Results = {"policy": str(args.policy), "step": policy.step, "quick": args.quick}
+    about: Results = {"policy": policy_name(args.policy), "step": policy.step, "quick": args.quick}
     about |= {"seed": args.seed, "size": dataclasses.asdict(args.size)}
 
     def keep(found: Results) -> None:

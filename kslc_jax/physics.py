@@ -28,6 +28,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a notice about an 
     from mujoco import mjx
 
 from kslc_jax import robot as robot_lib
+from kslc_jax import runtime
 from kslc_jax.config import PhysicsConfig
 from kslc_jax.motors import SERVO_DAMPING, drive
 from kslc_jax.randomize import Dynamics, model_fields
@@ -87,6 +88,8 @@ def step(
 ) -> PhysicsState:
     """Advances one environment by one control step towards the joint targets [16, rad].
 
+    The new state has the dtypes of the old one, also in a program that enables x64.
+
     Args:
       config: engine and solver.
       state: before the step.
@@ -138,8 +141,11 @@ def _step_mjx(
 ) -> PhysicsState:
     robot = robot_for(config)
     model = _mjx_model(config).replace(**fields)
-    data = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax").replace(
-        qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
+    blank = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax")
+    data = blank.replace(
+        qpos=state.qpos.astype(blank.qpos.dtype),  # under x64 the state need not be float64
+        qvel=state.qvel.astype(blank.qvel.dtype),
+        qacc_warmstart=state.qacc_warmstart.astype(blank.qacc_warmstart.dtype),
     )
     if force is not None:
         data = data.replace(xfrc_applied=force)
@@ -152,13 +158,14 @@ def _step_mjx(
     with jax.default_matmul_precision("highest"):
         data, torques = jax.lax.scan(substep, data, None, length=config.decimation)
         data = _refresh_sensors(model, data)
-    return PhysicsState(
+    new = PhysicsState(
         qpos=data.qpos,
         qvel=data.qvel,
         qacc_warmstart=data.qacc_warmstart,
         sensordata=data.sensordata,
         torque=torques[-1],
     )
+    return jax.tree.map(lambda x, old: x.astype(old.dtype), new, state)
 
 
 def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
@@ -179,10 +186,14 @@ _batches_lock = threading.Lock()
 
 def _batch(robot: Robot, size: int, threads: int, written: frozenset[str]) -> mujoco.batch.Batch:
     """Simulator batch of this size (cached). Every call of `_host_step` overwrites its state and
-    the model fields `written`; all other fields are the robot's."""
+    the model fields `written`; all other fields are the robot's.
+
+    MuJoCo's own default, 0 threads, would start one for every CPU of the machine.
+    """
     key = (robot, size, threads, written)
     if key not in _batches:
-        _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=threads)
+        count = threads or runtime.usable_cpus()
+        _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=count)
     return _batches[key]
 
 
@@ -215,7 +226,8 @@ def _host_step(
     fields: dict[str, np.ndarray],
     force: np.ndarray | None,
 ) -> PhysicsState:
-    """One control step of a batch in C MuJoCo; numpy in, numpy out.
+    """One control step of a batch in C MuJoCo; numpy in, numpy out. The result has the dtypes of
+    `state`.
 
     It must not run JAX: that would wait for the running program, which waits for this callback.
     """
@@ -226,6 +238,7 @@ def _host_step(
         x = np.asarray(x, np.float64)
         return x.reshape(-1, *x.shape[len(lead) :])
 
+    like = state
     state, dynamics, fields, force = jax.tree.map(rows, (state, dynamics, fields, force))
     target = rows(target)
     applied = {} if force is None else {"xfrc_applied": force}
@@ -253,4 +266,6 @@ def _host_step(
             sensordata=sensordata,
             torque=torque,
         )
-        return jax.tree.map(lambda x: np.array(x, np.float32).reshape(*lead, *x.shape[1:]), new)
+        return jax.tree.map(
+            lambda x, old: np.array(x, old.dtype).reshape(*lead, *x.shape[1:]), new, like
+        )

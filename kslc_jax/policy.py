@@ -1,5 +1,6 @@
 """A trained policy: to act with, to load, to save. Knows no training."""
 
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,10 @@ from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import files, networks, observations
 from kslc_jax.checkpoint_format import (
+    ROBOT_NUMBERS,
     CheckpointError,
     abstract,
+    changed_robot,
     checked_metadata,
     checksum,
     clear_away,
@@ -24,6 +27,7 @@ from kslc_jax.checkpoint_format import (
 )
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.fingerprint import Fingerprint
 from kslc_jax.runtime import first_line
 
 POLICIES = Path(__file__).parent / "policies"
@@ -43,8 +47,9 @@ class Policy:
 
     config: Config
     params: networks.Params
-    curriculum: Curriculum  # where the training had got to: v_max and gait cycle
+    curriculum: Curriculum  # progress of the training: v_max and gait cycle
     step: int
+    robot: Fingerprint | None = None  # numbers of the robot that was trained; None: not known
 
     def init(self) -> PolicyState:
         """Memory before the first frame."""
@@ -62,6 +67,8 @@ class Policy:
 
 def load_policy(path_or_name: str | Path) -> Policy:
     """Loads a policy from a run folder, a checkpoint folder, or by the name of a shipped one.
+
+    Warns where the robot has changed since the training, and names the numbers.
 
     Raises:
       CheckpointError: nothing there, or it cannot be read.
@@ -82,6 +89,8 @@ def load_policy(path_or_name: str | Path) -> Policy:
             args = ocp.args.Composite(params=ocp.args.StandardRestore(abstract(like)))
             params = reader.restore(folder, args=args)["params"]
             require_checksum(meta.get("checksums", {}), "params", checksum(params))
+            trained = meta.get(ROBOT_NUMBERS)
+            changed = changed_robot(trained)
         except Exception as error:  # damaged metadata can lead orbax anywhere
             raise CheckpointError(
                 f"{folder} is no readable checkpoint: {first_line(error)}"
@@ -89,25 +98,46 @@ def load_policy(path_or_name: str | Path) -> Policy:
     finite = all(np.isfinite(x).all() for x in jax.tree.leaves(params))
     if not finite:
         raise CheckpointError(f"{folder}: the parameters hold NaN or infinity")
-    return Policy(config, params, curriculum, step)
+    if changed:
+        name = policy_name(path_or_name)
+        text = f"{name}: the robot has changed since the training of this policy: {changed}"
+        warnings.warn(text, stacklevel=2)
+    return Policy(config, params, curriculum, step, trained)
 
 
 def save_policy(policy: Policy, folder: Path) -> None:
-    """Writes what `load_policy` reads and nothing else; CheckpointError if it cannot."""
+    """Writes the items that `load_policy` reads; CheckpointError if it cannot."""
     reached = policy.curriculum
     metrics = {
         "step": policy.step,
         "curriculum/v_max": float(reached.v_max),
         "curriculum/cycle_time": float(reached.cycle_time),
     }
-    meta = metadata(policy.config, metrics, {"params": policy.params})
+    meta = metadata(policy.config, metrics, {"params": policy.params}, policy.robot)
     items = {"params": ocp.args.StandardSave(policy.params), "meta": ocp.args.JsonSave(meta)}
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
         try:
             writer.save(folder.resolve(), args=ocp.args.Composite(**items))
+            _forget_where(folder)
         except (OSError, ValueError) as error:
             clear_away(folder.parent)
             raise CheckpointError(f"cannot write {folder}: {first_line(error)}") from error
+
+
+def _forget_where(folder: Path) -> None:
+    """Takes the absolute path out of orbax's notes in a stored policy; only their presence counts,
+    and policies are passed on to others."""
+    for note in folder.rglob("commit_success.txt"):
+        note.write_text("Checkpoint commit was successful\n")
+
+
+def policy_name(path_or_name: str | Path) -> str:
+    """The name of a run, of a stored policy or of a shipped one, for results that others read:
+    without the folders of this machine. A checkpoint has the name of its run."""
+    path = Path(path_or_name).resolve()
+    if path.name.isdigit() and path.parent.name in (files.CHECKPOINTS, files.SNAPSHOTS):
+        path = path.parent
+    return path.parent.name if path.name in (files.CHECKPOINTS, files.SNAPSHOTS) else path.name
 
 
 def checkpoint_folder(path: Path) -> Path:

@@ -1,18 +1,22 @@
-"""What must be set before JAX starts, and what the machine decides. Imports JAX only when asked."""
+"""Settings that must be made before JAX starts, and facts about this machine. JAX is imported only
+by the functions that need it."""
 
 import contextlib
 import ctypes.util
 import faulthandler
 import inspect
 import logging
+import math
 import os
 import statistics
 import sys
 import time
+import warnings
 from collections import deque
 from collections.abc import Generator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from kslc_jax.errors import UserError
 
@@ -20,16 +24,37 @@ BAD_JAX = ("0.10.", "0.11.0")
 """JAX versions whose CPU backend can hang for ever in batched Cholesky factorisations."""
 
 JAX_FIX = "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
-"""A JAX that does not, as in pyproject.toml."""
+"""Command that installs a JAX that does not hang; the versions are those of pyproject.toml."""
 
 
 IDLE_GPU = "there is an NVIDIA GPU, but JAX computes on the CPU"
 
 CUDA_FIX = "pip install 'kslc_jax[cuda]'"
-"""A JAX that computes on it."""
+"""Command that installs a JAX for NVIDIA GPUs."""
 
 NVIDIA = Path("/dev/nvidia0")
-"""There where the driver of an NVIDIA GPU is."""
+"""Exists where the driver of an NVIDIA GPU is loaded."""
+
+NUMERICS: dict[str, str | bool | int | None] = {
+    "jax_enable_x64": False,
+    "jax_default_matmul_precision": None,
+    "jax_default_prng_impl": "threefry2x32",
+    "jax_threefry_partitionable": True,
+    "jax_random_seed_offset": 0,
+    "jax_numpy_dtype_promotion": "standard",
+    "jax_numpy_rank_promotion": "allow",
+    "jax_disable_jit": False,
+    "jax_debug_nans": False,
+    "jax_debug_infs": False,
+}
+"""JAX's options that change numbers, or that stop at a NaN which this package masks, with the
+values that all commands use: JAX's defaults."""
+
+_YES, _NO = ("1", "true", "t", "yes", "y", "on"), ("0", "false", "f", "no", "n", "off")
+
+XLA_THREADS = "PJRT_NPROC"
+"""Variable that tells XLA how many threads to start on a CPU. By itself XLA knows the affinity, but
+no quota."""
 
 
 GL_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
@@ -43,13 +68,89 @@ def cache_dir() -> Path:
 
 
 def prepare(gl: bool = True) -> None:
-    """Sets environment variables: a quiet XLA, a persistent compilation cache, and with `gl` the
-    library that draws off screen. Variables that the user has set stay. Call it before JAX and
-    MuJoCo are imported."""
+    """Sets environment variables: a quiet XLA, a persistent compilation cache, as many threads as
+    this process may use, and with `gl` the library that draws off screen. Variables that the user
+    has set stay, except those that change numbers (`NUMERICS`), which are overridden with a warning
+    on stderr. Call it before JAX and MuJoCo are imported."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_dir()))
+    if usable_cpus() < affine_cpus():
+        os.environ.setdefault(XLA_THREADS, str(usable_cpus()))
+    if others := fix_numerics():
+        print(f"warning: {', '.join(others)} ignored: numbers would change", file=sys.stderr)
     if gl:
         choose_gl()
+
+
+def fix_numerics() -> list[str]:
+    """Resets JAX's options that change numbers, in the environment, and in JAX where it is already
+    imported; returns what was set otherwise, as NAME=VALUE."""
+    found = {}
+    for name, ours in NUMERICS.items():
+        text = os.environ.pop(name.upper(), "")
+        if text and not _means(text, ours):
+            found[name.upper()] = text
+        if "jax" in sys.modules:
+            options = sys.modules["jax"].config
+            value = getattr(options, name, ours)  # a JAX may have dropped an option
+            if value != ours:
+                found.setdefault(name.upper(), str(value))
+                options.update(name, ours)
+    return [f"{name}={value}" for name, value in found.items()]
+
+
+def _means(text: str, value: str | bool | int | None) -> bool:
+    """True if JAX reads `text` in the environment as `value`."""
+    if isinstance(value, bool):
+        return text.lower() in (_YES if value else _NO)
+    return text == str(value)
+
+
+def affine_cpus() -> int:
+    """CPUs that the process's affinity allows."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def cpu_quota(root: Path = Path("/")) -> float:
+    """CPUs that the process's control groups, and those above them, allow it; a fraction is
+    possible, infinity is no limit. Reads Linux's cgroups of version 2 (`cpu.max`) and 1."""
+    quota = math.inf
+    for line in _read(root / "proc/self/cgroup").splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers and "cpu" not in controllers.split(","):
+            continue
+        top = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
+        parts = [part for part in path.split("/") if part]
+        # In a container the path may be the host's; then its top is the container's own group.
+        groups = [top.joinpath(*parts[:depth]) for depth in range(len(parts) + 1)]
+        quota = min([quota, *map(_group_quota, groups)])
+    return quota
+
+
+def _group_quota(group: Path) -> float:
+    """CPUs that one control group allows."""
+    v1 = _read(group / "cpu.cfs_quota_us"), _read(group / "cpu.cfs_period_us")
+    words = _read(group / "cpu.max").split() or [word.strip() for word in v1]
+    try:
+        quota, period = map(float, words)
+    except ValueError:  # "max", or no such files
+        return math.inf
+    return quota / period if quota > 0 and period > 0 else math.inf
+
+
+def _read(path: Path) -> str:
+    """Text of a file; empty where it cannot be read."""
+    try:
+        return path.read_text()
+    except OSError:
+        return ""
+
+
+def usable_cpus() -> int:
+    """Threads that this process can run at the same time: as affinity and quota allow."""
+    return max(1, math.ceil(min(affine_cpus(), cpu_quota())))
 
 
 def choose_gl() -> None:
@@ -64,12 +165,13 @@ def choose_gl() -> None:
 
 
 def quiet() -> None:
-    """Silences what libraries say of errors that this package reports itself. It changes the whole
-    process: for commands only."""
-    # Orbax raises what went wrong, and besides tells of it in pages of its threads' tracebacks.
+    """Silences libraries' reports of errors that this package reports itself, and prints Python
+    warnings in one line. It changes the whole process: for commands only."""
+    # Orbax raises its errors, and also prints pages of tracebacks of its threads.
     for name in ("absl", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     sys.excepthook, sys.unraisablehook = _excepthook, _unraisablehook
+    warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
 
 
 def _excepthook(
@@ -84,13 +186,18 @@ def _unraisablehook(args: "sys.UnraisableHookArgs") -> None:
         sys.__unraisablehook__(args)
 
 
+def _one_line(message: Warning | str, *_: Any, **__: Any) -> str:
+    """A Python warning without the source line that raised it."""
+    return f"warning: {message}\n"
+
+
 def first_line(error: Exception) -> str:
     """The first line of an error's message, cut to what fits a terminal."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def idle_gpu() -> str:
-    """What to say where an NVIDIA GPU is there that JAX does not use; empty where there is none."""
+    """A message if there is an NVIDIA GPU that JAX does not use; else empty."""
     import jax
 
     if jax.default_backend() != "cpu" or not NVIDIA.exists():
@@ -99,18 +206,18 @@ def idle_gpu() -> str:
 
 
 class JaxError(UserError):
-    """An installed JAX that must not be trained with."""
+    """The installed JAX cannot train reliably."""
 
 
 def require_good_jax() -> None:
-    """JaxError where the installed JAX is known to hang on this machine."""
+    """Raises JaxError if the installed JAX is known to hang on this machine."""
     import jax
 
     check_jax(jax.__version__, jax.default_backend())
 
 
 def check_jax(version: str, backend: str) -> None:
-    """JaxError for versions that hang on this backend, with the fix."""
+    """Raises JaxError, with the fix, for versions that hang on this backend."""
     if backend == "cpu" and version.startswith(BAD_JAX):
         raise JaxError(f"jax {version} can hang for ever on a CPU, install another: {JAX_FIX}")
 
@@ -118,8 +225,7 @@ def check_jax(version: str, backend: str) -> None:
 class Watchdog:
     """Prints every thread's stack to stderr while a step takes far longer than those before.
 
-    faulthandler's thread does the waiting and the printing: it runs even where this program's
-    threads cannot.
+    faulthandler's own thread waits and prints: it runs even where Python's threads cannot.
     """
 
     def __init__(self, factor: float = 20.0, least: float = 60.0, first: float = 600.0):
@@ -134,7 +240,7 @@ class Watchdog:
 
     @contextlib.contextmanager
     def step(self) -> Generator[None]:
-        """Watches over one step."""
+        """Watches one step."""
         start = time.monotonic()
         faulthandler.dump_traceback_later(self.limit(), file=2)
         try:

@@ -233,7 +233,7 @@ def main(argv: list[str] | None = None) -> int:
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, keeps the numbers."""
     simulator(args.engine)  # what is not installed is told before anything is loaded
-    from kslc_jax.policy import load_policy
+    from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
@@ -251,7 +251,7 @@ def _report(args: Args) -> None:
         results = sweeps(args, policy, progress)
     _show(args, screen, results, f"{args.policy}, train step {policy.step}, {args.engine}")
     if args.json is not None:
-        what = {"policy": str(args.policy), "step": policy.step}
+        what = {"policy": policy_name(args.policy), "step": policy.step}
         how = {name: getattr(args, name) for name in CONDITIONS}
         files.write_json(args.json, {**what, **how, "conditions": results})
 

@@ -1,12 +1,14 @@
 """Behaviour of all commands: one line for an error, its exit code, process-wide settings."""
 
 import logging
+import math
 import os
 import sys
 
+import jax
 import pytest
 
-from kslc_jax import cli, runtime
+from kslc_jax import cli, doctor, physics, robot, runtime
 from kslc_jax.config import ConfigError
 from kslc_jax.errors import MissingPackage, UserError
 from kslc_jax.training.recovery import NumbersError
@@ -89,3 +91,119 @@ def test_preparing_chooses_the_gl_that_is_there(there, chosen, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glfw")
     runtime.prepare()
     assert os.environ["MUJOCO_GL"] == "glfw"
+
+
+NUMERICS = {
+    "JAX_ENABLE_X64": "1",
+    "JAX_DEBUG_NANS": "true",
+    "JAX_DEFAULT_MATMUL_PRECISION": "bfloat16",
+    "JAX_THREEFRY_PARTITIONABLE": "0",
+    "JAX_RANDOM_SEED_OFFSET": "3",
+}
+
+
+def test_variables_that_change_numbers_are_overridden(monkeypatch, capsys):
+    """In one line, and not passed on to child processes."""
+    for name, value in NUMERICS.items():
+        monkeypatch.setenv(name, value)
+    runtime.prepare(gl=False)
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and all(f"{n}={v}" in said for n, v in NUMERICS.items())
+    assert not set(NUMERICS) & set(os.environ)
+    runtime.prepare(gl=False)
+    assert capsys.readouterr().err == ""
+
+
+def test_variables_that_change_nothing_are_no_word(monkeypatch, capsys):
+    for name in NUMERICS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("JAX_ENABLE_X64", "False")
+    monkeypatch.setenv("JAX_THREEFRY_PARTITIONABLE", "1")
+    monkeypatch.setenv("JAX_DEBUG_NANS", "")
+    runtime.prepare(gl=False)
+    assert capsys.readouterr().err == ""
+
+
+def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
+    """A notebook may have set them before it calls a command."""
+    before = {name: getattr(jax.config, name) for name in runtime.NUMERICS}
+    assert before == runtime.NUMERICS  # JAX's defaults, with the oldest JAX and the newest
+    try:
+        jax.config.update("jax_enable_x64", True)
+        jax.config.update("jax_default_matmul_precision", "bfloat16")
+        runtime.prepare(gl=False)
+        said = capsys.readouterr().err
+        assert "JAX_ENABLE_X64=True" in said and "MATMUL_PRECISION=bfloat16" in said
+        assert {name: getattr(jax.config, name) for name in runtime.NUMERICS} == before
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
+
+
+def cgroup(root, groups: str, **files: str) -> None:
+    """A machine's control groups under `root`; a file's name has `__` for a slash."""
+    for name, text in {"proc__self__cgroup": groups, **files}.items():
+        path = root.joinpath(*name.split("__"))
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "quota"),
+    [
+        ("0::/", {"sys__fs__cgroup__cpu.max": "200000 100000\n"}, 2.0),
+        ("0::/", {"sys__fs__cgroup__cpu.max": "max 100000\n"}, math.inf),
+        ("0::/a/b", {"sys__fs__cgroup__a__cpu.max": "150000 100000\n"}, 1.5),  # of a group above
+        ("0::/hosts/own", {"sys__fs__cgroup__cpu.max": "50000 100000\n"}, 0.5),  # in a container
+        (
+            "3:cpuset:/\n2:cpu,cpuacct:/job\n0::/",
+            {
+                "sys__fs__cgroup__cpu__job__cpu.cfs_quota_us": "300000\n",
+                "sys__fs__cgroup__cpu__job__cpu.cfs_period_us": "100000\n",
+                "sys__fs__cgroup__cpu__cpu.cfs_quota_us": "-1\n",
+                "sys__fs__cgroup__cpu__cpu.cfs_period_us": "100000\n",
+            },
+            3.0,
+        ),
+        ("", {}, math.inf),
+    ],
+)
+def test_the_quota_of_cpus(tmp_path, groups, files, quota):
+    cgroup(tmp_path, groups, **files)
+    assert runtime.cpu_quota(tmp_path) == quota
+
+
+def test_a_machine_without_control_groups(tmp_path):
+    assert runtime.cpu_quota(tmp_path) == math.inf
+
+
+def test_threads_are_as_many_as_affinity_and_quota_allow(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    monkeypatch.delenv(runtime.XLA_THREADS, raising=False)
+    for affine, quota, usable, said in (
+        (64, 2.0, 2, "2 of 64 (quota)"),
+        (64, 1.5, 2, "2 of 64 (quota)"),
+        (64, 0.2, 1, "1 of 64 (quota)"),
+        (4, 16.0, 4, "4 of 64 (affinity)"),
+        (64, math.inf, 64, "64 of 64"),
+    ):
+        monkeypatch.setattr(runtime, "affine_cpus", lambda affine=affine: affine)
+        monkeypatch.setattr(runtime, "cpu_quota", lambda quota=quota: quota)
+        assert (runtime.usable_cpus(), doctor.check_cores()) == (usable, said)
+        os.environ.pop(runtime.XLA_THREADS, None)
+        runtime.prepare(gl=False)
+        assert os.environ.pop(runtime.XLA_THREADS, None) == (
+            str(usable) if usable < affine else None
+        )
+
+
+def test_the_engine_takes_as_many_threads_as_are_allowed(monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        physics.mujoco.batch, "Batch", lambda model, size, nthread: asked.append(nthread)
+    )
+    monkeypatch.setattr(physics, "_batches", {})
+    monkeypatch.setattr(runtime, "usable_cpus", lambda: 3)
+    physics._batch(robot.load(), 7, threads=0)
+    physics._batch(robot.load(), 7, threads=5)
+    assert asked == [3, 5]

@@ -2,6 +2,7 @@
 
 import json
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -85,3 +86,31 @@ def test_the_film_comes_first_and_is_small():
 
 def test_the_citation_has_the_packages_version():
     assert f"\nversion: {kslc_jax.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
+HOMES = ("home", "Users", "root", "tmp", "work", "workspace", "mnt", "scratch", "private")
+"""Folders under / in which people and machines work."""
+
+
+def absolute_paths(content: bytes) -> list[bytes]:
+    """Paths below one of `HOMES` that stand in a file."""
+    return re.findall(rb"(?<![\w.~/-])/(?:%s)/[\w.-]+" % "|".join(HOMES).encode(), content)
+
+
+def test_no_file_names_a_folder_of_somebodys_machine():
+    """Results and stored policies name runs."""
+    try:
+        listed = subprocess.run(
+            ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("not in a git checkout")
+    names = [name for name in listed.stdout.decode().split("\0") if name]
+    found = {name: absolute_paths((ROOT / name).read_bytes()) for name in names}
+    assert len(found) > 100 and {name: paths for name, paths in found.items() if paths} == {}
+
+
+def test_a_folder_of_somebodys_machine_is_found():
+    folder = "/".join(["", "home", "me", "runs"])
+    assert absolute_paths(f'{{"policy": "{folder}"}}'.encode()) == [b"/home/" + b"me"]
+    assert absolute_paths(b"runs/tmp/x https://example.org/home/x") == []

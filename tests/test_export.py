@@ -199,6 +199,12 @@ def saved(symmetric, tmp_path_factory):
     return folder
 
 
+def test_a_stored_policy_names_no_folder(saved):
+    paths = [path for path in saved.rglob("*") if path.is_file()]
+    assert len(paths) > 5
+    assert not [path for path in paths if str(saved.parent).encode() in path.read_bytes()]
+
+
 def test_a_policy_folder_is_the_whole_policy(symmetric, saved):
     back = policy_lib.load_policy(saved)
     assert back.config == symmetric.config and back.step == symmetric.step
@@ -317,6 +323,37 @@ def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
         track = runner.simulate(controller, model, 0.01 * steps)
         wanted = trajectory.physics.qpos[: steps + 1, i, :3]
         np.testing.assert_allclose(track, wanted, atol=1e-4)
+
+
+def test_the_runner_refuses_a_timestep_that_does_not_fill_the_control_step(runner, onnx_file):
+    model = mujoco.MjModel.from_xml_path(str(robot.MODEL_PATH))
+    controller = runner.Controller(onnx_file, 0.0)
+    for timestep in (0.003, 0.004, 0.0015, 0.02):
+        model.opt.timestep = timestep
+        with pytest.raises(SystemExit, match=rf"^error: timestep {timestep} s does not divide .*"):
+            runner.simulate(controller, model, 0.1)
+    counts = [runner.steps_per_control(0.01, x) for x in (0.001, 0.0005, 0.01 / 3, 0.005, 0.01)]
+    assert counts == [10, 20, 3, 2, 1]
+
+
+def test_the_runners_clock_takes_the_measured_time(runner, onnx_file):
+    """A control step that took twice as long moves the gait by twice as much."""
+    measured = (np.array([1.0, 0, 0, 0]), np.zeros(3), np.zeros(16), np.zeros(16))
+    once, twice = (runner.Controller(onnx_file, 1.0) for _ in range(2))
+    once.targets(*measured)
+    once.targets(*measured)
+    twice.targets(*measured, dt=2 * twice.meta.control_dt)
+    assert twice.phase == pytest.approx(once.phase) and once.phase > 0
+
+
+def test_the_runner_walks_on_at_the_edge_of_the_dead_zone(runner, onnx_file):
+    controller = runner.Controller(onnx_file, 0.19)
+    assert controller.meta.command.dead_zone == 0.2
+    seen = []
+    for vx in (0.21, 0.19, -0.181, 0.179, 0.19):
+        controller.command(vx)
+        seen.append(round(float(controller.velocity[0]), 3))
+    assert seen == [0.21, 0.2, -0.2, 0.0, 0.0]
 
 
 def test_motor_torque_is_the_packages(runner, symmetric, xbot):

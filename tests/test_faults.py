@@ -3,15 +3,18 @@
 import ast
 import contextlib
 import dataclasses
+import functools
 import json
 import os
 import pickle
+import re
 import resource
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import jax
@@ -24,8 +27,10 @@ from kslc_jax import (
     checkpoint_format,
     doctor,
     files,
+    fingerprint,
     physics,
     ppo,
+    robot,
     rollout,
     runtime,
     train,
@@ -550,6 +555,99 @@ class TestSchema:
         for load in (policy_lib.load_policy, restored):
             with pytest.raises(CheckpointError, match=r"another robot, .*XBot-S.*XBot-L"):
                 load(tmp_path)
+
+
+@pytest.fixture
+def edit_robot(tmp_path, monkeypatch):
+    """Changes the robot's MJCF, for this process, from one text to another."""
+
+    def edit(old: str, new: str) -> None:
+        text = robot.MODEL_PATH.read_text()
+        assert old in text
+        path = tmp_path / "robot.xml"
+        path.write_text(text.replace(old, new, 1))
+        monkeypatch.setattr(robot, "MODEL_PATH", path)
+        monkeypatch.setattr(robot, "load", functools.lru_cache(robot.load.__wrapped__))
+
+    return edit
+
+
+MASS = 'mass="21.081917"'
+CHANGES = {
+    MASS: ('mass="9.5"', "mass of base_link 21.0819 -> 9.5"),
+    'kp="15"': ('kp="30"', "kp of left_ankle_pitch_joint 15 -> 30, kp of left_ankle_roll_joint"),
+    'armature="0.01"': ('armature="0.02"', "armature of left_leg_roll_joint 0.01 -> 0.02, "),
+    'pos="-0.01987378 ': ('pos="-0.02987378 ', "inertias"),
+}
+"""A text of the MJCF, what takes its place, and what is said of it."""
+
+
+class TestChangedRobot:
+    """A training or a policy of a robot that has other numbers now."""
+
+    def test_the_same_robot_is_no_word(self, saved, restored, tmp_path):
+        saved(tmp_path, 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert restored(tmp_path) == (1, [])
+            policy_lib.load_policy(tmp_path)
+
+    @pytest.mark.parametrize("old", CHANGES)
+    def test_every_kind_of_change_is_named(self, edit_robot, old):
+        new, said = CHANGES[old]
+        before = fingerprint.fingerprint()
+        assert fingerprint.changes(before, before) == ""
+        edit_robot(old, new)
+        found = fingerprint.changes(before, fingerprint.fingerprint())
+        assert found.startswith(said) and len(found) < 200
+
+    def test_resume_and_policy_say_so(self, saved, restored, tmp_path, edit_robot):
+        saved(tmp_path, 1)
+        edit_robot(MASS, 'mass="9.5"')
+        step, said = restored(tmp_path)
+        assert step == 1 and len(said) == 1
+        assert re.search("changed since checkpoint 1: .*mass of base_link .* -> 9.5; from", said[0])
+        with pytest.warns(
+            UserWarning, match=r"robot has changed since .*base_link .* -> 9\.5"
+        ) as w:
+            policy = policy_lib.load_policy(tmp_path)
+        assert len(w) == 1 and "\n" not in str(w[0].message)
+        policy_lib.save_policy(policy, tmp_path / "copy")  # is still of the old robot
+        with pytest.warns(UserWarning, match="base_link"):
+            policy_lib.load_policy(tmp_path / "copy")
+
+    def test_older_checkpoints_have_no_numbers_and_load_without_a_word(
+        self, saved, restored, tmp_path, edit_robot
+    ):
+        def older(meta):
+            del meta[checkpoint_format.ROBOT_NUMBERS], meta["checksums"]
+
+        edit_meta(saved(tmp_path, 1), older)
+        edit_robot(MASS, 'mass="9.5"')
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert restored(tmp_path) == (1, [])
+            policy = policy_lib.load_policy(tmp_path)
+            policy_lib.save_policy(policy, tmp_path / "copy")
+            assert policy_lib.load_policy(tmp_path / "copy").robot is None
+
+    def test_a_shipped_policy_knows_its_robot(self, edit_robot):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            policy_lib.load_policy("xbot_l_run")
+        edit_robot('kp="350"', 'kp="700"')
+        with pytest.warns(UserWarning, match=r"^xbot_l_run: .*kp of left_\w+ 350 -> 700"):
+            policy_lib.load_policy("xbot_l_run")
+
+    def test_both_fidelities_count(self, edit_robot):
+        """Joint friction acts at high fidelity only."""
+        before = fingerprint.fingerprint()
+        text = re.search(
+            r'name="high_frictionloss"[^>]*data="([\d.]+)', robot.MODEL_PATH.read_text()
+        )
+        edit_robot(text[0], text[0][: -len(text[1])] + "0.123")
+        said = fingerprint.changes(before, fingerprint.fingerprint())
+        assert said == "joint friction and damping at high fidelity"
 
 
 class Bomb:

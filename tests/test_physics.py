@@ -382,3 +382,22 @@ def test_every_range_is_filled_independently():
         np.testing.assert_allclose(ends, [low, high], atol=0.02 * (high - low), err_msg=name)
     apart = np.corrcoef(np.concatenate(columns, 1).T)
     assert np.abs(apart - np.eye(len(apart))).max() < 0.1
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_program_that_enables_x64_can_step(engine, monkeypatch):
+    """A script may need float64 for other things. The state keeps its dtypes, so it can be scanned
+    over. Traced only: that is where a wrong dtype shows, and compiling takes long."""
+    config = PhysicsConfig(engine=engine)
+    monkeypatch.setattr(physics, "_mjx_model", physics._mjx_model.__wrapped__)  # caches nothing
+    jax.config.update("jax_enable_x64", True)
+    try:
+        state = standing(config)
+        assert {str(x.dtype) for x in jax.tree.leaves(state)} == {"float32", "float64"}
+        step = lambda s, _: (physics.step(config, s, s.qpos[7:], randomize.nominal(), GROUND), None)  # noqa: E731
+        after = jax.eval_shape(lambda s: jax.lax.scan(step, s, None, 2)[0], state)
+        assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, state)
+        if engine == "mujoco":  # quickly compiled
+            step(state, None)
+    finally:
+        jax.config.update("jax_enable_x64", False)

@@ -435,7 +435,33 @@ def test_a_longer_run_is_remembered(whole, tmp_path):
 
 def test_git_is_not_needed(monkeypatch):
     monkeypatch.setenv("PATH", "")
-    assert run_folder.versions()["git"] == "unknown"
+    versions = run_folder.versions()
+    assert versions["git"] == "unknown" and versions["kslc_jax"] == kslc_jax.__version__
+
+
+def git(folder: Path, *command: str) -> str:
+    who = ("-c", "user.name=somebody", "-c", "user.email=somebody@example.org")
+    argv = ["git", "-C", str(folder), *who, *command]
+    return subprocess.run(argv, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def test_only_a_checkout_of_this_package_has_a_revision(tmp_path, monkeypatch):
+    """Not the repository of somebody who has installed the package into it, also if all is added;
+    and not the repository that a git hook runs in."""
+    for top, known in (("", True), (".venv/lib/site-packages", False)):
+        repository = tmp_path / f"repository-{known}"
+        module = repository / top / "kslc_jax" / "training" / "run_folder.py"
+        module.parent.mkdir(parents=True)
+        module.touch()
+        git(repository.parent, "init", "-q", str(repository))
+        git(repository, "commit", "-q", "--allow-empty", "-m", "empty")
+        assert run_folder._revision(module) == ""  # git does not track it yet
+        git(repository, "add", "--force", ".")
+        git(repository, "commit", "-q", "-m", "all")
+        commit = git(repository, "rev-parse", "--short", "HEAD")
+        assert run_folder._revision(module) == (commit if known else "")
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "repository-True" / ".git"))
+    assert run_folder._revision(module) == ""
 
 
 def test_every_field_can_be_overridden():

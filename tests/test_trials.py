@@ -292,3 +292,21 @@ def test_the_shipped_policy_walks_and_runs():
     assert walk["forward_mean"] == pytest.approx(1.0, abs=0.1)
     assert run["forward_mean"] == pytest.approx(2.83, abs=0.2)
     assert run["flight_share"] > 0.1 and run["shoulder_hip_correlation"] < -0.8
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("xbot_l_run", "xbot_l_run"),
+        ("runs/mine", "mine"),
+        ("runs/mine/checkpoints", "mine"),
+        ("runs/mine/checkpoints/120", "mine"),
+        ("runs/mine/snapshots/120", "mine"),
+        ("runs/7", "7"),
+    ],
+)
+def test_results_name_a_run_and_no_folder(path, name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert policy_lib.policy_name(path) == name
+    assert policy_lib.policy_name(tmp_path / path) == name
+    assert policy_lib.policy_name(".") == tmp_path.name

@@ -101,6 +101,33 @@ def test_a_push_changes_the_base_velocity(still):
     np.testing.assert_allclose(change[:2], push, atol=0.15)
 
 
+def test_a_joystick_that_trembles_at_the_edge_of_the_dead_zone():
+    walks, seen = False, []
+    for vx in (0.19, 0.2, 0.21, 0.19, 0.185, -0.19, 0.179, 0.19, 0.21):
+        velocity, walks = session.steady(np.array([vx, 0.0, 0.3]), walks, 0.2)
+        seen.append((round(float(velocity[0]), 3), walks))
+        assert velocity[2] == 0.3
+    assert seen == [
+        *((0.19, False), (0.2, False), (0.21, True), (0.2, True), (0.2, True), (-0.2, True)),
+        *((0.179, False), (0.19, False), (0.21, True)),
+    ]
+
+
+def test_a_session_walks_on_at_the_edge_and_a_fresh_one_stands(still):
+    """The environment's own dead zone does not make the edge zero, in any direction."""
+    live, fresh = (session.Session(still, C_MUJOCO) for _ in range(2))
+    live.advance(np.array([0.5, 0.0, 0.0]))
+    for angle in np.linspace(0.0, 6.0, 7):
+        command = 0.19 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        live.advance(command)
+        fresh.advance(command)
+        moving = live._memory.env.command.velocity[:2]
+        assert np.hypot(*moving) == pytest.approx(0.2, rel=1e-4)
+        assert (fresh._memory.env.command.velocity == 0.0).all()
+    live.advance(np.array([0.17, 0.0, 0.0]))
+    assert (live._memory.env.command.velocity == 0.0).all()
+
+
 def test_a_fallen_robot_lies_a_second_and_starts_anew(still):
     live = session.Session(still, C_MUJOCO)
     views = [live.advance(np.zeros(3)) for _ in range(500)]

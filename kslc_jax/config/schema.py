@@ -69,7 +69,8 @@ class PhysicsConfig:
     ls_iterations: int = 5
     """Line-search iterations of the contact solver."""
     threads: int = 0
-    """CPU threads of the mujoco engine; 0: all cores. Does not change results."""
+    """CPU threads of the mujoco engine; 0: all CPUs that this process may use. Does not change
+    results."""
 
     def __post_init__(self):
         require(self.timestep > 0, "physics.timestep must be positive")

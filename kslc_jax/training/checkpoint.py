@@ -10,8 +10,10 @@ import orbax.checkpoint as ocp
 
 from kslc_jax import files, ppo
 from kslc_jax.checkpoint_format import (
+    ROBOT_NUMBERS,
     CheckpointError,
     abstract,
+    changed_robot,
     checked_metadata,
     checksum,
     clear_away,
@@ -19,6 +21,7 @@ from kslc_jax.checkpoint_format import (
     require_checksum,
 )
 from kslc_jax.config import Config
+from kslc_jax.fingerprint import fingerprint
 from kslc_jax.policy import Policy
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
@@ -81,7 +84,7 @@ class Store:
             return
         parts = _split(state)
         items = {name: ocp.args.StandardSave(part) for name, part in parts.items()}
-        meta = metadata(config, metrics, parts)
+        meta = metadata(config, metrics, parts, fingerprint())
         with self._writing():
             saved = self._manager.save(
                 step,
@@ -117,16 +120,22 @@ class Store:
     def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState:
         """The latest whole checkpoint, as the type of `like` (arrays or their abstract shapes).
 
-        A damaged one is reported through `warn`, put aside, and the one before it is taken.
+        A damaged one is reported through `warn`, put aside, and the one before it is taken. A robot
+        that has changed since then is reported too.
         """
         steps, bad = self.steps(), {}
         for step in reversed(steps):
             try:
-                state = self._restore(step, like)
+                state, changed = self._restore(step, like)
             except Exception as error:  # damaged metadata can lead orbax anywhere
                 bad[step] = first_line(error)
                 continue
             self._put_aside(bad, step, warn)
+            if changed:
+                warn(
+                    f"the robot has changed since checkpoint {step}: {changed}; from here on "
+                    "numbers differ from those of an uninterrupted training"
+                )
             return state
         if not steps:
             raise CheckpointError(f"no checkpoint in {self.folder}")
@@ -134,7 +143,7 @@ class Store:
         raise CheckpointError(f"no readable checkpoint in {self.folder}; the latest: {why}")
 
     def _put_aside(self, bad: dict[int, str], used: int, warn: Callable[[str], None]) -> None:
-        """Renames what is in the way of the steps to come."""
+        """Renames the damaged checkpoints, whose steps will come again."""
         for step, why in bad.items():
             names = (f"damaged-{step}" + "-again" * i for i in itertools.count())
             aside = next(p for p in map(self.folder.joinpath, names) if not p.exists())
@@ -143,7 +152,8 @@ class Store:
         if bad:
             self._manager.reload()
 
-    def _restore(self, step: int, like: TrainState) -> TrainState:
+    def _restore(self, step: int, like: TrainState) -> tuple[TrainState, str]:
+        """The state, and the numbers in which the robot has changed since it was saved."""
         parts = _split(like)
         items = {name: ocp.args.StandardRestore(abstract(part)) for name, part in parts.items()}
         only_meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
@@ -152,7 +162,8 @@ class Store:
         sums = meta.get("checksums", {})
         for name in items:
             require_checksum(sums, name, checksum(restored[name]))
-        return _join({name: restored[name] for name in items}, like)
+        changed = changed_robot(meta.get(ROBOT_NUMBERS))
+        return _join({name: restored[name] for name in items}, like), changed
 
     def close(self) -> None:
         """Waits for writes and lets go of the folder."""
@@ -161,5 +172,6 @@ class Store:
 
 
 def policy_of(config: Config, state: TrainState) -> Policy:
-    """The policy that a training has got to."""
-    return Policy(config, ppo.deployed(state.learner), state.curriculum, int(state.step))
+    """The present policy of a training."""
+    params, step = ppo.deployed(state.learner), int(state.step)
+    return Policy(config, params, state.curriculum, step, fingerprint())

@@ -24,6 +24,7 @@ from kslc_jax import files, physics, train_step
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.networks import Params
+from kslc_jax.policy import policy_name
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
 from kslc_jax.training import devices, memory, profiling, recovery
@@ -187,7 +188,7 @@ def _starting_from(
         state = start(init(), params, curriculum)
         return state if mesh is None else devices.place(mesh, state)
 
-    return begin, {"start_from": f"{path}, train step {step}"}
+    return begin, {"start_from": f"{policy_name(path)}, train step {step}"}
 
 
 def _train(job: _Job) -> TrainState:

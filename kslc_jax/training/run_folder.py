@@ -15,8 +15,8 @@ from typing import Any
 
 import jax
 
+from kslc_jax import __version__, files
 from kslc_jax import config as config_lib
-from kslc_jax import files
 from kslc_jax.checkpoint_format import has_checkpoints
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
@@ -31,25 +31,44 @@ class RunError(UserError):
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result depends on, and the git revision if there is one."""
+    """Versions that a result depends on; `git` is the commit of this package's own checkout, or
+    "unknown" where the package was installed without one."""
     found = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {
         "python": platform.python_version(),
         "machine": platform.machine(),
         "device": str(jax.devices()[0].device_kind),
-        "git": _revision() or "unknown",
+        "kslc_jax": __version__,
+        "git": _revision(Path(__file__)) or "unknown",
         **found,
     }
 
 
-def _revision() -> str:
-    """Of the git checkout that this file lies in; empty where there is none, or no git."""
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty"]
+def _revision(module: Path) -> str:
+    """Commit of the checkout that holds `module`, a file of this package; empty without one.
+
+    The package may be installed within somebody else's repository, whose commit says nothing of
+    this code. So the checkout must hold the package at its top, and git must track the module.
+    """
+    package = module.resolve().parents[1]
+    top = _git(package, "rev-parse", "--show-toplevel")
+    if not top or Path(top).resolve() != package.parent:
+        return ""
+    if not _git(package, "ls-files", "--", str(module.resolve())):
+        return ""
+    return _git(package, "describe", "--always", "--dirty")
+
+
+def _git(folder: Path, *command: str) -> str:
+    """Output of a git command in `folder`; empty where it fails or git is missing."""
+    # In a git hook these variables name the repository of the hook.
+    env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
+    argv = ["git", "-C", str(folder), *command]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(argv, capture_output=True, text=True, check=False, env=env)
     except OSError:
         return ""
-    return done.stdout.strip()
+    return done.stdout.strip() if done.returncode == 0 else ""
 
 
 @contextlib.contextmanager

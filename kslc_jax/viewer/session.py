@@ -20,6 +20,27 @@ from kslc_jax.policy import Policy
 FALLEN_SECONDS = 1.0
 """Time that a fallen robot lies still before the next episode starts."""
 
+EPSILON = 1e-5
+"""Share by which the slowest command lies above the dead zone, in float32."""
+
+
+STOP = 0.9
+"""Share of the dead zone below which a walking robot stops."""
+
+
+def steady(velocity: np.ndarray, walks: bool, dead_zone: float) -> tuple[np.ndarray, bool]:
+    """A command [3] that does not start and stop the robot at each trembling of a joystick at the
+    edge of the dead zone [m/s], and True if the robot is to walk.
+
+    Walking begins above the dead zone and ends below `STOP` of it. In between a walking robot is
+    asked for the edge, the slowest command of the training.
+    """
+    speed = float(np.hypot(*velocity[:2]))
+    if not speed > dead_zone * (STOP if walks else 1.0):
+        return velocity, False
+    edge = dead_zone * (1.0 + EPSILON)
+    return velocity * np.array([*2 * [max(edge / speed, 1.0)], 1.0]), True
+
 
 @flax.struct.dataclass
 class View:
@@ -103,7 +124,7 @@ class Session:
         memory, view = _reset(self._config, self.policy.curriculum, key)
         # On a named device, like the loaded parameters. Else the second step compiles again.
         self._memory = jax.device_put(memory, jax.devices()[0])
-        self._lies = 0.0
+        self._lies, self._walks = 0.0, False
         self.view = jax.device_get(view)
         return self.view
 
@@ -117,6 +138,8 @@ class Session:
         if self._lies > self.dt / 2:
             self._lies -= self.dt
             return self.view
+        dead_zone = self._config.command.dead_zone
+        command, self._walks = steady(np.asarray(command), self._walks, dead_zone)
         self._memory, view = _advance(
             self._config,
             self.policy.params,
