@@ -1,4 +1,4 @@
-"""What the commands share: their command line, errors in one line, exit codes.
+"""Parts that all commands share: parsing, errors in one line, exit codes, output that lasts.
 
 A command module imports neither JAX nor MuJoCo at its top, so that `--help` is quick.
 """
@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from kslc_jax import runtime
+from kslc_jax import runtime, streams
 from kslc_jax.errors import UserError
 
 A = TypeVar("A")
@@ -28,13 +28,27 @@ def parse(name: str, kind: type[A], argv: list[str] | None, text: str | None, **
     return tyro.cli(kind, args=argv, description=text, prog=prog, **more)
 
 
-def run(do: Callable[[], int | None]) -> int:
-    """The exit code of a command whose work is `do()`: 0 for None. A UserError is printed in one
-    line and gives its own code."""
+
+def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
+    """Runs a command; returns its exit code.
+
+    Args:
+      do: the command's work; returns its exit code, None for 0. A UserError is printed in one line
+        and gives its own code.
+      needs_output: it has failed if its output cannot be written, say on a full disk. Output that
+        nobody reads any more (a closed pipe or terminal) is no failure.
+    """
     runtime.prepare(gl=False)
     runtime.quiet()
-    try:
-        return do() or 0
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    streams.open_missing()
+    with streams.lasting() as output:
+        try:
+            code = do() or 0
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            code = error.exit_code
+    if needs_output and code == 0 and output.failure:
+        print(f"error: cannot write the output: {output.failure.strerror}", file=sys.stderr)
+        return 2
+    return code
+# ----------------------------------------------------------------------------------------- running

@@ -143,8 +143,8 @@ def headline(args: Args) -> tuple[str, Path]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return cli.run(lambda: _main(sys.argv[1:] if argv is None else argv))
+    """Entry point; returns the exit code. The run folder has all numbers: output may be lost."""
+    return cli.run(lambda: _main(sys.argv[1:] if argv is None else argv), needs_output=False)
 
 
 def _main(argv: list[str]) -> int:

@@ -30,7 +30,18 @@ OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "vise
 OPTIONAL |= {"kslc_jax.viewer.panel": "viser"}
 """Modules whose package may not be installed."""
 
-LIGHT = ("config", "robots", "errors", "files", "cli", "train", "evaluate", "sim2sim", "play")
+LIGHT = (
+    "config",
+    "robots",
+    "errors",
+    "files",
+    "streams",
+    "cli",
+    "train",
+    "evaluate",
+    "sim2sim",
+    "play",
+)
 LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "evaluation.tables")
 """Modules that are there before JAX is: a config can be checked, and `--help` is quick."""
 
