@@ -28,6 +28,7 @@ from rich.table import Table
 from kslc_jax import cli, evaluate, files, plots
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError, Fidelity
+from kslc_jax.training import stopping
 
 WIDTH = 200
 """Columns of the table, whatever the terminal has: to be copied, not torn."""
@@ -165,22 +166,24 @@ def is_done(job: Job, args: Args) -> bool:
 
 
 def call(module: str, arguments: tuple[str, ...]) -> bool:
-    """Whether a command of this package succeeded. At Ctrl-C, which it hears too, and at SIGTERM,
-    which is passed on, it is given the time to save; then KeyboardInterrupt."""
+    """Runs a command of this package; True if it succeeded.
+
+    A signal that stops a training is passed on as SIGTERM. The command has the time to save; then
+    KeyboardInterrupt."""
     process = subprocess.Popen([sys.executable, "-m", f"kslc_jax.{module}", *arguments])
+    signalled = False
 
     def terminate(number: int, _: FrameType | None) -> None:
-        process.terminate()
-        raise KeyboardInterrupt
+        nonlocal signalled
+        signalled = True
+        if number != signal.SIGINT:  # a terminal sends that one to both
+            process.terminate()
 
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        return process.wait() == 0
-    except KeyboardInterrupt:
-        process.wait()
-        raise
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with stopping.handling(terminate):
+        code = process.wait()
+    if signalled:
+        raise KeyboardInterrupt
+    return code == 0
 
 
 def finished(out: Path) -> list[Path]:

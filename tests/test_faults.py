@@ -1,6 +1,7 @@
 """What a training survives: bad numbers, a full disk, damaged files, a second one in its folder."""
 
 import ast
+import asyncio
 import contextlib
 import dataclasses
 import json
@@ -11,6 +12,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -303,6 +305,74 @@ class TestGoingBack:
         (tmp_path / "x.npz").write_bytes(pickle.dumps("no dump"))
         assert doctor.main(["replay", str(tmp_path / "x.npz")]) == 2
         assert "is no dump" in capsys.readouterr().err
+
+
+# ----------------------------------------------------------------------------------- circumstances
+
+
+class TestAround:
+    """Where a training runs makes no difference to it."""
+
+    @staticmethod
+    def closed_output(monkeypatch):
+        reader, writer = os.pipe()
+        stream = os.fdopen(writer, "w")
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setattr(sys, "__stdout__", stream)
+        return reader
+
+    def test_its_output_is_closed_on_the_way(self, training, monkeypatch):
+        """`| head -n 2`, a pager that is left, tee at Ctrl-C."""
+        reader = self.closed_output(monkeypatch)
+
+        def poison(state):
+            if int(state.step) == 3:
+                os.close(reader)
+            return state
+
+        assert training(poison) == 0
+        assert steps_of(training.dir) == list(range(1, 9))
+        assert Store(training.dir).steps()[-1] == 8
+
+    def test_stopped_with_its_output_closed(self, training, monkeypatch):
+        os.close(self.closed_output(monkeypatch))
+
+        def poison(state):
+            if int(state.step) == 3:
+                signal.raise_signal(signal.SIGHUP)
+            return state
+
+        assert training(poison) == 0
+        assert Store(training.dir).steps()[-1] == 4
+
+    @pytest.mark.parametrize("name", ["SIGHUP", "SIGUSR1"])
+    def test_warnings_stop_like_sigterm(self, name, training, capsys):
+        def poison(state):
+            if int(state.step) == 3:
+                signal.raise_signal(getattr(signal, name))
+            return state
+
+        assert training(poison) == 0
+        assert f"stopped by {name} at train step 4, saved" in capsys.readouterr().out
+        assert Store(training.dir).steps()[-1] == 4
+
+    def test_in_a_thread(self, training, capsys):
+        codes = []
+        thread = threading.Thread(target=lambda: codes.append(training(lambda state: state)))
+        thread.start()
+        thread.join()
+        assert codes == [0] and "done: 8 train steps" in capsys.readouterr().out
+
+    def test_in_a_notebooks_cell_twice(self, training, capsys):
+        """A cell runs within an event loop; its output has no file descriptor."""
+
+        async def cell():
+            first = training(lambda state: state)
+            return first, training(lambda state: state, "--resume", "--steps", 1280)
+
+        assert asyncio.run(cell()) == (0, 0)
+        assert "done: 10 train steps" in capsys.readouterr().out
+        assert steps_of(training.dir) == list(range(1, 11))
 
 
 # ------------------------------------------------------------------------------------- full disks

@@ -9,12 +9,10 @@ import contextlib
 import functools
 import os
 import shlex
-import signal
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import jax
@@ -32,32 +30,7 @@ from kslc_jax.training.logs import Progress
 from kslc_jax.training.recorder import NullRecorder, Record, Recorder, snapshot_due
 from kslc_jax.training.recovery import NonFiniteState, NumbersError, NumericsCheck
 from kslc_jax.training.run_folder import locked, open_folder, writing
-
-SAME_SIGNAL_SECONDS = 1.0
-"""Seconds within which signals count as one: a scheduler that signals every process of a job tells
-a training twice, itself and by way of what started it."""
-
-
-class _Stop:
-    """Turns the first SIGINT or SIGTERM into a request that the loop reads between steps."""
-
-    def __init__(self) -> None:
-        self.requested: str | None = None
-        self._since = 0.0
-
-    def __enter__(self) -> "_Stop":
-        self._old = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, _: FrameType | None) -> None:
-        if not self.requested:
-            self.requested, self._since = signal.Signals(number).name, time.monotonic()
-        elif time.monotonic() - self._since > SAME_SIGNAL_SECONDS:  # a second one means now
-            raise KeyboardInterrupt
+from kslc_jax.training.stopping import stop_requests
 
 
 @dataclass(frozen=True)
@@ -249,7 +222,7 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
     first = int(state.step)
     record: Record = {}
     numerics, watchdog = NumericsCheck(state), Watchdog()
-    with _Stop() as stop, contextlib.ExitStack() as opened:
+    with stop_requests() as stop, contextlib.ExitStack() as opened:
         devices.on_first(lambda: opened.enter_context(job.recorder.at(first)))
         for step in range(first + 1, job.config.num_updates + 1):
             numerics.before(state)
