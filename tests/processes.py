@@ -21,7 +21,7 @@ METRICS = dict.fromkeys(
         *("curriculum/v_max", "curriculum/cycle_time", "curriculum/tracking"),
     ],
     0.5,
-)
+) | {"broken": 0.0}
 """As a train step gives them, as far as loop, recorder and progress read them."""
 
 

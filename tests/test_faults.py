@@ -202,7 +202,8 @@ def training(state_at, tmp_path, monkeypatch):
                 state = poison(state)
                 finite = rollout.finite(state.learner.params)
                 skipped = jnp.isinf(state.learner.learning_rate)
-                metrics = METRICS | {"finite": finite, "ppo/skipped": skipped}
+                broken = run.broken(int(state.step))
+                metrics = METRICS | {"finite": finite, "ppo/skipped": skipped, "broken": broken}
                 return state.replace(step=state.step + 1), metrics
 
         monkeypatch.setattr(train_step, "make", lambda config: (lambda: state_at(0), Step()))
@@ -210,6 +211,7 @@ def training(state_at, tmp_path, monkeypatch):
         return train.main(["--preset", "debug", "--run-dir", str(run.dir), *often])
 
     run.dir = tmp_path / "r"
+    run.broken = lambda step: 0.0  # share of the samples, after so many train steps
     return run
 
 
@@ -305,6 +307,54 @@ class TestGoingBack:
         (tmp_path / "x.npz").write_bytes(pickle.dumps("no dump"))
         assert doctor.main(["replay", str(tmp_path / "x.npz")]) == 2
         assert "is no dump" in capsys.readouterr().err
+
+
+class TestBrokenSamples:
+    """Many are said, and all of them for long end a training; both patience 10 train steps."""
+
+    LONG = ("--steps", 40 * 128)
+
+    def test_ten_train_steps_with_many_are_said_once(self, training, capsys):
+        training.broken = lambda step: 0.02 if 5 <= step < 30 else 0.01
+        assert training(lambda state: state, *self.LONG) == 0
+        out = capsys.readouterr().out
+        assert out.count("warning: ") == 1 and "done: 40 train steps" in out
+        assert "in each of the last 10 train steps more than 1% of the samples were broken" in out
+        assert "2.0% in the last one" in out
+
+    def test_a_second_spell_is_said_again(self, training, capsys):
+        training.broken = lambda step: 0.0 if step == 15 else 0.5
+        assert training(lambda state: state, *self.LONG) == 0
+        assert capsys.readouterr().out.count("warning: ") == 2
+
+    def test_nine_are_not(self, training, capsys):
+        training.broken = lambda step: 0.0 if step % 10 == 9 else 0.99
+        assert training(lambda state: state, *self.LONG) == 0
+        assert "warning" not in capsys.readouterr().out
+
+    def test_all_for_long_end_it_with_one_line(self, training, capsys):
+        training.broken = lambda step: 1.0 if step >= 5 else 0.0
+        assert training(lambda state: state, *self.LONG) == 1
+        said = capsys.readouterr()
+        assert "every sample was broken in 10 train steps; back to train step 5" in said.out
+        (line,) = said.err.splitlines()
+        assert line.startswith("error: every sample was broken in 10 train steps, also after 3")
+        assert Store(training.dir).steps()[-1] == 5, "a state that learnt nothing was saved"
+        assert int(recovery.read_dump(training.dir / files.BAD_STATE)[1].step) == 5
+
+    def test_a_short_training_is_not_done_either(self, training, capsys):
+        training.broken = lambda step: 1.0
+        assert training(lambda state: state) == 1
+        said = capsys.readouterr()
+        assert (
+            said.err == "error: every sample was broken in all 8 train steps: nothing is learnt\n"
+        )
+        assert "done" not in said.out and Store(training.dir).steps() == [8]
+
+    def test_the_last_steps_alone_are_no_failure(self, training, capsys):
+        training.broken = lambda step: 1.0 if step >= 5 else 0.0
+        assert training(lambda state: state) == 0
+        assert "done: 8 train steps" in capsys.readouterr().out
 
 
 # ----------------------------------------------------------------------------------- circumstances

@@ -232,7 +232,8 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
                 record = {name: float(value) for name, value in jax.device_get(metrics).items()}
                 took = time.monotonic() - tick
             record = job.recorder.log(record, step, took)
-            numerics.after(record)
+            if warning := numerics.after(record):
+                job.progress.warn(warning)
             if numerics.good and snapshot_due(job.config, step):
                 job.recorder.keep_snapshot(state)
             stopped, due = devices.agree(stop.requested is not None, job.recorder.due())
@@ -245,6 +246,8 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
         if record and numerics.finite:
             last = devices.whole(state)
             devices.on_first(lambda: job.recorder.finish(last, record))
+    if not stop.requested:
+        numerics.require_some_good()
     _farewell(job, int(state.step), stop.requested, numerics.finite)
     return state
 
