@@ -8,6 +8,7 @@ import json
 import os
 import pickle
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
@@ -423,6 +424,98 @@ class TestAround:
         assert asyncio.run(cell()) == (0, 0)
         assert "done: 10 train steps" in capsys.readouterr().out
         assert steps_of(training.dir) == list(range(1, 11))
+
+
+def files_of(folder):
+    """What every file of a folder holds, locks apart."""
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
+
+
+class TestResume:
+    """What --resume says, and what it keeps."""
+
+    @pytest.fixture
+    def done(self, training, capsys):
+        """Goes on with a training of 8 train steps, 1024 environment steps; what it says."""
+        assert training(lambda state: state) == 0
+
+        def resume(*args, code=0):
+            capsys.readouterr()
+            assert training(lambda state: state, "--resume", *args) == code
+            said = capsys.readouterr()
+            return said.err if code else said.out
+
+        resume.dir = training.dir
+        return resume
+
+    @pytest.mark.parametrize(
+        ("steps", "says"),
+        [
+            (100, "has done 1024 environment steps, more than the 100 that --steps asks for"),
+            ("1024", "has done 1024 environment steps, all of the 1024 that --steps asks for"),
+        ],
+    )
+    def test_nothing_is_left_to_do(self, steps, says, done):
+        before = files_of(done.dir)
+        out = done("--steps", steps)
+        assert "nothing to do: " in out and says in out
+        assert "compiled" not in out and "done:" not in out
+        assert files_of(done.dir) == before
+
+    @pytest.mark.parametrize(
+        ("change", "says"),
+        [
+            (["--ppo.learning-rate", "3e-4"], "ppo.learning_rate is 1e-05 in the run that is"),
+            (["--env.num-envs", "32"], "env.num_envs is 16 in the run that is there, not 32"),
+            (["--seed", "5"], "seed is 0 in the run that is there, not 5"),
+            (["--env.frames", "4"], "env.frames is 3 in the run that is there, not 4"),
+        ],
+    )
+    def test_another_config_names_the_command(self, change, says, done, monkeypatch):
+        """What is to be typed gives the config that was asked for."""
+        before = files_of(done.dir)
+        line = done(*change, code=2)
+        assert says in line and len(line.splitlines()) == 1
+        command = shlex.split(line.rpartition(": ")[2])
+        assert command[:3] == ["python", "-m", "kslc_jax.train"]
+        args = train.parse(command[3:])
+        assert args.config == train.parse(["--preset", "debug", *change]).config
+        assert args.run_dir == done.dir.with_name("r-2") and not args.run_dir.exists()
+        same_networks = "--env.frames" not in change
+        assert args.start_from == (done.dir if same_networks else None)
+        assert files_of(done.dir) == before
+
+    def test_other_versions(self, done, monkeypatch):
+        path = done.dir / "versions.json"
+        first = json.loads(path.read_text())
+        assert first["engine"] == "mujoco" and first["devices"] == 1
+        old = first | {"jax": "0.8.0", "python": "3.10.1", "engine": "mjx", "devices": 4}
+        path.write_text(json.dumps(old))
+        line = done("--steps", 1152).splitlines()[0]
+        assert line.startswith("resuming with ") and "(bits may differ from here)" in line
+        for said in (
+            f"jax {first['jax']} instead of 0.8.0",
+            f"python {first['python']} instead of 3.10.1",
+            "engine mujoco instead of mjx",
+            "devices 1 instead of 4",
+        ):
+            assert said in line
+        kept = json.loads(path.read_text())
+        (news,) = kept.pop("resumed")
+        assert kept == old
+        changed = ("jax", "python", "engine", "devices")
+        assert news == {"train_step": 8} | {name: first[name] for name in changed}
+        assert done("--steps", 1280).startswith("resuming: ")  # as the last time
+        assert len(json.loads(path.read_text())["resumed"]) == 1
+
+    @pytest.mark.parametrize("content", [None, "{", "[]", '{"resumed": 3}', '{"jax": "0.8.0"}'])
+    def test_versions_that_say_less(self, content, done):
+        """Older runs name fewer; the file may be damaged. No number depends on it."""
+        path = done.dir / "versions.json"
+        path.unlink() if content is None else path.write_text(content)
+        out = done("--steps", 1152)
+        assert out.startswith("resuming with jax" if content and "jax" in content else "resuming: ")
+        assert json.loads(path.read_text())["resumed"][0]["jax"] == jax.__version__
 
 
 # ------------------------------------------------------------------------------------- full disks

@@ -8,6 +8,7 @@ the paper builds on and which settles what the paper leaves open. Each departure
 docs/fidelity.md.
 """
 
+from kslc_jax.config.options import options
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
@@ -55,6 +56,7 @@ __all__ = [
     "RewardWeights",
     "RunConfig",
     "from_dict",
+    "options",
     "preset",
     "require_seed",
     "to_dict",
