@@ -59,6 +59,9 @@ class Args:
     folder, or the name of a shipped policy. A lower --ppo.learning-rate keeps what it can do."""
     profile: int = 0
     """Write the profiler's trace of this many train steps, after the first, into the run folder."""
+    wandb: bool = False
+    """Send the records to Weights & Biases, too: pip install 'kslc_jax[wandb]'. Without an account,
+    set the environment variable WANDB_MODE=offline."""
     devices: Literal["auto"] | int = "auto"
     """Number of this process's devices to train on. auto: as many accelerators as share the
     environments evenly; one CPU."""
@@ -179,6 +182,7 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     if idle := runtime.idle_gpu():
         progress.warn(idle)
     how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
+    how["wandb"] = args.wandb
     try:
         loop.train(args.config, run_dir, args.resume, progress, **how)
     except NumbersError as error:  # all processes meet it

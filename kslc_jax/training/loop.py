@@ -24,7 +24,7 @@ from kslc_jax.curriculum import Curriculum
 from kslc_jax.networks import Params
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
-from kslc_jax.training import devices, memory, profiling, recovery, run_folder
+from kslc_jax.training import devices, memory, profiling, recovery, run_folder, wandb_run
 from kslc_jax.training.checkpoint_process import ChildProcessStorage, LocalStorage
 from kslc_jax.training.logs import Progress
 from kslc_jax.training.recorder import NullRecorder, Record, Recorder, snapshot_due
@@ -62,6 +62,7 @@ def train(
     start_from: Path | None = None,
     mesh: Mesh | None = None,
     profile: int = 0,
+    wandb: bool = False,
 ) -> TrainState:
     """Trains until `config.run.steps` or a signal. Saves the state then, and every few minutes.
 
@@ -73,9 +74,11 @@ def train(
       start_from: a policy whose networks and curriculum a new training begins with.
       mesh: the devices of all processes, see `devices.mesh`; None for one device.
       profile: train steps to trace, see `profiling`.
+      wandb: send the records to Weights & Biases as well, see `wandb_run`.
 
     Raises:
       RunError, ConfigError, CheckpointError: it cannot start, or its last state cannot be saved.
+      MissingPackage, UserError: `wandb` is asked for and not there, or refuses.
       NumbersError: numbers went bad again and again, or nothing was learnt at all.
       Elsewhere: the first process raised one of these, and this is another process.
     """
@@ -94,7 +97,7 @@ def train(
         facts = run_folder.circumstances(config, 1 if mesh is None else mesh.size) | origin
         recorder = devices.on_first(
             lambda: stack.enter_context(
-                _recorder(config, run_dir, resume, facts, progress, storage)
+                _recorder(config, run_dir, resume, facts, progress, storage, wandb)
             )
         )
         tracing = profiling.Profile(
@@ -117,17 +120,21 @@ def _recorder(
     facts: dict[str, Any],
     progress: Progress,
     storage: LocalStorage,
+    wandb: bool,
 ) -> Generator[Recorder]:
     """Opens the run folder and locks it for this process."""
+    if wandb:
+        wandb_run.package()  # before anything is written
     if not resume:
         with writing(run_dir):
             run_dir.mkdir(parents=True, exist_ok=True)
-    with locked(run_dir):
+    with locked(run_dir), contextlib.ExitStack() as stack:
         open_folder(run_dir, config, resume, facts)
         with writing(run_dir):
-            store = storage.open(run_dir, config)
-        with contextlib.closing(store):
-            yield Recorder(config, run_dir, store, progress, storage.save_policy)
+            store = stack.enter_context(contextlib.closing(storage.open(run_dir, config)))
+        online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if wandb else None
+        run = stack.enter_context(online) if online else None
+        yield Recorder(config, run_dir, store, progress, storage.save_policy, run)
 
 
 def _starting_from(
