@@ -1,10 +1,10 @@
 """Watch a policy: python -m kslc_jax.play POLICY
 
-Opens a live viewer in the browser: sliders command the robot while it runs. With --gait-strip or
---video it draws, off screen, the paper's gait figure (the robot every 0.25 s on a 1 m grid, one
-strip per speed) or a film of one speed after the other instead. Full C MuJoCo at high fidelity
-unless told otherwise; strips and films also in Drake. POLICY is a run folder, a checkpoint folder,
-or a shipped policy's name.
+Opens a live viewer in the browser: sliders command the robot while it runs. With --follow it takes
+each new policy of a training that is running. With --gait-strip or --video it draws, off screen,
+the paper's gait figure (the robot every 0.25 s on a 1 m grid, one strip per speed) or a film of one
+speed after the other instead. Full C MuJoCo at high fidelity unless told otherwise; strips and
+films also in Drake. POLICY is a run folder, a checkpoint folder, or a shipped policy's name.
 """
 
 import contextlib
@@ -48,6 +48,8 @@ class Args:
     """What simulates strip and video; drake needs its package (pip install 'kslc_jax[drake]')."""
     seed: int = 0
     """Of the initial state."""
+    follow: bool = False
+    """Watch a training while it runs: take each new checkpoint or snapshot of this run folder."""
     host: str = "127.0.0.1"
     """Address of the viewer. The default is reached from this machine only; 0.0.0.0 from all."""
     port: int = 8080
@@ -75,12 +77,14 @@ class Args:
             raise ConfigError(f"engine: {self.engine} takes the robot at --fidelity high only")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
+        if self.follow and not self.live:
+            raise ConfigError("follow is for the live viewer, not for --gait-strip and --video")
         if self.live and self.engine != "mujoco":
             raise ConfigError(f"engine: {self.engine} is for --gait-strip and --video only")
 
     @property
     def live(self) -> bool:
-        """Whether to open the viewer."""
+        """True if the viewer opens."""
         return self.gait_strip is None and self.video is None
 
 
@@ -211,7 +215,7 @@ def draw(args: Args, policy) -> None:
 
 
 def is_local(host: str) -> bool:
-    """Whether an address is reached from this machine only."""
+    """True if an address is reached from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -228,7 +232,8 @@ def watch(args: Args) -> None:
     if not is_local(args.host):
         print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
     with contextlib.suppress(KeyboardInterrupt):
-        viewer = Viewer(args.policy, args.fidelity, args.host, args.port, args.seed)
+        how = (args.fidelity, args.host, args.port, args.seed, args.follow)
+        viewer = Viewer(args.policy, *how)
         host = "localhost" if is_local(args.host) else args.host
         print(f"viewer: http://{host}:{viewer.server.get_port()} (Ctrl-C ends it)", flush=True)
         viewer.run()
