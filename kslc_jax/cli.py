@@ -1,16 +1,18 @@
-"""What the commands share: their command line, errors in one line, exit codes.
+"""Parts that all commands share: parsing, errors in one line, exit codes, output that lasts.
 
 A command module imports neither JAX nor MuJoCo at its top, so that `--help` is quick.
 """
 
 import sys
 from collections.abc import Callable
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
-from kslc_jax import runtime
+from kslc_jax import runtime, streams
 from kslc_jax.errors import UserError
 
 A = TypeVar("A")
@@ -22,19 +24,68 @@ Paths = Annotated[
 """Paths on a command line; the command checks that there is one."""
 
 
+# ----------------------------------------------------------------------------------------- parsing
+
+LONGEST = 30
+"""Digits of the longest whole number that a command line may hold; far above any bound."""
+
+
+def whole_number(text: str) -> int:
+    """The integer that `60000000`, `60_000_000` or `60e6` stands for; ValueError if it is none."""
+    try:
+        number = Decimal(text)
+        if number.is_finite() and number.adjusted() < LONGEST and number == int(number):
+            return int(number)
+    except InvalidOperation:
+        pass
+    raise ValueError(f"{text!r} is not a whole number, such as 2048, 60_000_000 or 60e6")
+
+
+_registry = ConstructorRegistry()
+
+
+@_registry.primitive_rule
+def _integers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
+    """tyro's rule for all integer options, also within tuples and unions."""
+    if info.type is not int:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=lambda words: whole_number(words[0]),
+        is_instance=lambda value: isinstance(value, int) and not isinstance(value, bool),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
 def parse(name: str, kind: type[A], argv: list[str] | None, text: str | None, **more: Any) -> A:
     """The command line of `python -m kslc_jax.NAME` as a `kind`; `text` is its `--help`."""
     prog = f"python -m kslc_jax.{name}"
-    return tyro.cli(kind, args=argv, description=text, prog=prog, **more)
+    return tyro.cli(kind, args=argv, description=text, prog=prog, registry=_registry, **more)
 
 
-def run(do: Callable[[], int | None]) -> int:
-    """The exit code of a command whose work is `do()`: 0 for None. A UserError is printed in one
-    line and gives its own code."""
+# ----------------------------------------------------------------------------------------- running
+
+
+def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
+    """Runs a command; returns its exit code.
+
+    Args:
+      do: the command's work; returns its exit code, None for 0. A UserError is printed in one line
+        and gives its own code.
+      needs_output: it has failed if its output cannot be written, say on a full disk. Output that
+        nobody reads any more (a closed pipe or terminal) is no failure.
+    """
     runtime.prepare(gl=False)
     runtime.quiet()
-    try:
-        return do() or 0
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return error.exit_code
+    streams.open_missing()
+    with streams.lasting() as output:
+        try:
+            code = do() or 0
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            code = error.exit_code
+    if needs_output and code == 0 and output.failure:
+        print(f"error: cannot write the output: {output.failure.strerror}", file=sys.stderr)
+        return 2
+    return code

@@ -29,6 +29,7 @@ from rich.table import Table
 from kslc_jax import cli, evaluate, files, plots
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError, Fidelity
+from kslc_jax.training import stopping
 
 WIDTH = 200
 """Width of the table in characters. It does not follow the terminal, so no line breaks."""
@@ -172,22 +173,22 @@ def call(module: str, arguments: tuple[str, ...]) -> bool:
     """Runs a command of this package; True if it succeeded.
 
     A signal leaves the child time to save; then this function raises KeyboardInterrupt. The
-    terminal sends Ctrl-C to the child too. SIGTERM is passed on to it.
+    terminal sends Ctrl-C to the child too. Other signals are passed on to it as SIGTERM.
     """
     process = subprocess.Popen([sys.executable, "-m", f"kslc_jax.{module}", *arguments])
+    signalled = False
 
     def terminate(number: int, _: FrameType | None) -> None:
-        process.terminate()
-        raise KeyboardInterrupt
+        nonlocal signalled
+        signalled = True
+        if number != signal.SIGINT:  # a terminal sends that one to both
+            process.terminate()
 
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
-        return process.wait() == 0
-    except KeyboardInterrupt:
-        process.wait()
-        raise
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with stopping.handling(terminate):
+        code = process.wait()
+    if signalled:
+        raise KeyboardInterrupt
+    return code == 0
 
 
 def finished(out: Path) -> list[Path]:

@@ -21,6 +21,9 @@ METRICS = "metrics.jsonl"
 TENSORBOARD = "tensorboard"
 """Folder of the same records as TensorBoard events."""
 
+WANDB_ID = "wandb_id"
+"""Id of the training's run in Weights & Biases."""
+
 CHECKPOINTS = "checkpoints"
 """Folder of the checkpoints, one folder per train step."""
 

@@ -1,10 +1,11 @@
 """Watch a policy: python -m kslc_jax.play POLICY
 
-Opens a live viewer in the browser: sliders command the robot while it runs. The options
---gait-strip and --video draw off screen instead. --gait-strip draws the paper's gait figure: the
-robot every 0.25 s on a 1 m grid, one strip per speed. --video makes a film of one speed after the
-other. The default physics is C MuJoCo at high fidelity; strips and films can also use Drake. POLICY
-is a run folder, a checkpoint folder, or the name of a shipped policy.
+Opens a live viewer in the browser: sliders command the robot while it runs. The option --follow
+takes each new policy of a training that is running. The options --gait-strip and --video draw off
+screen instead. --gait-strip draws the paper's gait figure: the robot every 0.25 s on a 1 m grid,
+one strip per speed. --video makes a film of one speed after the other. The default physics is C
+MuJoCo at high fidelity; strips and films can also use Drake. POLICY is a run folder, a checkpoint
+folder, or the name of a shipped policy.
 """
 
 import contextlib
@@ -49,6 +50,8 @@ class Args:
     """Physics engine of strip and video; drake is an extra (pip install 'kslc_jax[drake]')."""
     seed: int = 0
     """Seed of the initial state."""
+    follow: bool = False
+    """Watch a training while it runs: take each new checkpoint or snapshot of this run folder."""
     host: str = "127.0.0.1"
     """Address of the viewer. Only this machine reaches the default; every machine reaches
     0.0.0.0."""
@@ -77,6 +80,8 @@ class Args:
             raise ConfigError(f"engine: {self.engine} takes the robot at --fidelity high only")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
+        if self.follow and not self.live:
+            raise ConfigError("follow is for the live viewer, not for --gait-strip and --video")
         if self.live and self.engine != "mujoco":
             raise ConfigError(f"engine: {self.engine} is for --gait-strip and --video only")
 
@@ -235,7 +240,8 @@ def watch(args: Args) -> None:
     if not is_local(args.host):
         print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
     with contextlib.suppress(KeyboardInterrupt):
-        viewer = Viewer(args.policy, args.fidelity, args.host, args.port, args.seed)
+        how = (args.fidelity, args.host, args.port, args.seed, args.follow)
+        viewer = Viewer(args.policy, *how)
         host = "localhost" if is_local(args.host) else args.host
         print(f"viewer: http://{host}:{viewer.server.get_port()} (Ctrl-C ends it)", flush=True)
         viewer.run()

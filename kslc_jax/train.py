@@ -45,12 +45,13 @@ class Args:
     preset: str = DEFAULT
     """paper, laptop, debug, baseline or baseline-laptop."""
     without: tuple[str, ...] = ()
-    """What to leave out, for ablations: arms, angular-momentum, velocity-rewards,
+    """Parts to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
     run_dir: Path | None = None
-    """Where everything goes; runs/PRESET-seedN if not given, with -no-PART for each ablation."""
+    """Folder for everything; runs/PRESET-seedN if not given, with -no-PART for each ablation."""
     steps: int | None = None
-    """Environment steps in all; short for --run.steps."""
+    """Environment steps in all, from the beginning of the run; 60e6 is a number, too. Short for
+    --run.steps."""
     resume: bool = False
     """Go on from the run folder's latest checkpoint."""
     start_from: Path | None = None
@@ -58,24 +59,28 @@ class Args:
     folder, or the name of a shipped policy. A lower --ppo.learning-rate keeps what it can do."""
     profile: int = 0
     """Write the profiler's trace of this many train steps, after the first, into the run folder."""
+    wandb: bool = False
+    """Send the records to Weights & Biases, too: pip install 'kslc_jax[wandb]'. Without an account,
+    set the environment variable WANDB_MODE=offline."""
     devices: Literal["auto"] | int = "auto"
-    """How many of this process's devices to train on. auto: as many accelerators as share the
-    environments evenly; of CPUs one."""
+    """Number of this process's devices to train on. auto: as many accelerators as share the
+    environments evenly; one CPU."""
     coordinator: str | None = None
     """One training of several processes: host:port where process 0 can be reached, or auto where
     Slurm, Open MPI, Kubernetes or a TPU pod tells. Each process gets the same command line, but
     for --process-index."""
     processes: int | None = None
-    """How many processes there are, with --coordinator host:port."""
+    """Number of processes, with --coordinator host:port."""
     process_index: int | None = None
-    """Which of them this is, from 0. The first one reads, writes and speaks."""
+    """Index of this process, from 0. The first one reads, writes and prints."""
     config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS[DEFAULT]
     """Every number of the training, as the preset has it."""
 
 
 def join(argv: list[str]) -> None:
-    """Makes this process one of several where the command line says so, before JAX does anything
-    else; ConfigError if it cannot."""
+    """Makes this process one of several if the command line says so; ConfigError if it cannot.
+
+    JAX must do nothing before."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("coordinator", "processes", "process-index"):
         early.add_argument(f"--{name}", f"--{name.replace('-', '_')}", dest=name)
@@ -91,7 +96,7 @@ def join(argv: list[str]) -> None:
 def cluster(
     coordinator: str | None, processes: str | None, index: str | None
 ) -> tuple[str | None, int | None, int | None]:
-    """What `devices.join` takes, of three options' values; ConfigError if they make no sense."""
+    """The arguments of `devices.join` from three options; ConfigError if they make no sense."""
     if (coordinator, processes, index) == ("auto", None, None):
         return None, None, None
     counts = [int(c) for c in (processes, index) if c is not None and c.isdecimal()]
@@ -134,7 +139,7 @@ def parse(argv: list[str]) -> Args:
 
 
 def headline(args: Args) -> tuple[str, Path]:
-    """What is about to run, in a few words, and its run folder."""
+    """The training in a few words, and its run folder."""
     if args.resume and args.run_dir is not None:
         return "resuming", args.run_dir
     name = "-no-".join([args.preset, *args.without])
@@ -143,8 +148,8 @@ def headline(args: Args) -> tuple[str, Path]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return cli.run(lambda: _main(sys.argv[1:] if argv is None else argv))
+    """Entry point; returns the exit code. The run folder has all numbers: output may be lost."""
+    return cli.run(lambda: _main(sys.argv[1:] if argv is None else argv), needs_output=False)
 
 
 def _main(argv: list[str]) -> int:
@@ -161,19 +166,23 @@ def _main(argv: list[str]) -> int:
 
 
 def _train(args: Args, mesh: "Mesh | None") -> int:
-    """The exit code. A process of several whose failure is its own ends at once."""
+    """Trains; returns the exit code. With several processes, one that fails alone ends at once."""
     from rich.console import Console
 
-    from kslc_jax.training import devices, loop
+    from kslc_jax.training import devices, loop, run_folder
     from kslc_jax.training.logs import Progress
     from kslc_jax.training.recovery import NumbersError
 
     title, run_dir = headline(args)
+    if args.resume:
+        here = run_folder.circumstances(args.config, 1 if mesh is None else mesh.size)
+        title = f"{title} {run_folder.what_changed(run_dir, here)}".rstrip()
     progress = Progress(args.config, None if devices.is_first() else Console(quiet=True))
     progress.say(f"{title}: {loop.describe(args.config, run_dir, mesh)}")
     if idle := runtime.idle_gpu():
         progress.warn(idle)
     how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
+    how["wandb"] = args.wandb
     try:
         loop.train(args.config, run_dir, args.resume, progress, **how)
     except NumbersError as error:  # all processes meet it

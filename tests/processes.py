@@ -21,7 +21,7 @@ METRICS = dict.fromkeys(
         *("curriculum/v_max", "curriculum/cycle_time", "curriculum/tracking"),
     ],
     0.5,
-)
+) | {"broken": 0.0}
 """The metrics of a train step that loop, recorder and progress read, with made-up values."""
 
 

@@ -8,7 +8,7 @@ import sys
 import jax
 import pytest
 
-from kslc_jax import cli, doctor, physics, robot, runtime
+from kslc_jax import cli, compare, doctor, physics, robot, runtime, train
 from kslc_jax.config import ConfigError
 from kslc_jax.errors import MissingPackage, UserError
 from kslc_jax.training.recovery import NumbersError
@@ -204,6 +204,29 @@ def test_the_engine_takes_as_many_threads_as_are_allowed(monkeypatch):
     )
     monkeypatch.setattr(physics, "_batches", {})
     monkeypatch.setattr(runtime, "usable_cpus", lambda: 3)
-    physics._batch(robot.load(), 7, threads=0)
-    physics._batch(robot.load(), 7, threads=5)
+    physics._batch(robot.load(), 7, 0, frozenset())
+    physics._batch(robot.load(), 7, 5, frozenset())
     assert asked == [3, 5]
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [("60000000", 60_000_000), ("60_000_000", 60_000_000), ("60e6", 60_000_000), ("-1.5e1", -15)],
+)
+def test_whole_numbers(text, number):
+    assert cli.whole_number(text) == number and type(cli.whole_number(text)) is int
+
+
+@pytest.mark.parametrize("text", ["1.5", "1e-1", "nan", "inf", "1e400000000", "x", ""])
+def test_no_whole_numbers(text):
+    with pytest.raises(ValueError, match="60_000_000 or 60e6"):
+        cli.whole_number(text)
+
+
+def test_every_integer_option_takes_them():
+    options = "--preset debug --steps 1e3 --env.num-envs 3.2e1 --devices 2e0 --seed 1e1"
+    args = train.parse([*options.split(), "--network.actor", "1e2", "5_0"])
+    assert (args.config.run.steps, args.config.env.num_envs, args.devices) == (1000, 32, 2)
+    assert args.config.network.actor == (100, 50) and args.config.seed == 10
+    compared = cli.parse("compare", compare.Args, ["--steps", "4e7", "--seeds", "0", "1e0"], None)
+    assert (compared.steps, compared.seeds) == (40_000_000, (0, 1))

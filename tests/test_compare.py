@@ -205,11 +205,15 @@ def test_a_job_ends_with_what_marks_it_as_done(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("number", "tell"),
-    [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill)],
-    ids=["to all", "to the parent"],
+    ("number", "tell", "heard"),
+    [
+        (signal.SIGINT, os.killpg, signal.SIGINT),
+        (signal.SIGTERM, os.kill, signal.SIGTERM),
+        (signal.SIGHUP, os.kill, signal.SIGTERM),
+    ],
+    ids=["to all", "to the parent", "a closed terminal"],
 )
-def test_a_signal_leaves_time_to_save(tmp_path, number, tell):
+def test_a_signal_leaves_time_to_save(tmp_path, number, tell, heard):
     """The child saves for longer than the 0.25 s that `subprocess.run` would allow it."""
     child = """
 import signal, sys, time
@@ -226,7 +230,7 @@ import signal, subprocess, sys
 from kslc_jax import compare
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
 start = subprocess.Popen
-child = [sys.executable, "-c", {child!r}, {str(tmp_path / "saved")!r}, "{number:d}"]
+child = [sys.executable, "-c", {child!r}, {str(tmp_path / "saved")!r}, "{heard:d}"]
 subprocess.Popen = lambda _: start(child)
 compare.call("train", ())
 """

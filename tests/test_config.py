@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from kslc_jax import config as config_lib
-from kslc_jax import observations
+from kslc_jax import observations, train
 from kslc_jax.config import (
     ABLATIONS,
     PRESETS,
@@ -553,3 +553,28 @@ def test_fields_that_older_files_lack_have_their_default(path, then):
     assert operator.attrgetter(path)(Config()) == then
     back = from_dict(edited(path, remove=True))
     assert back == PAPER and back.run == PAPER.run
+
+
+@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("without", [(), ("arms",), tuple(ABLATIONS)])
+def test_options_give_the_config_back(name, without):
+    wanted = preset(name, without)
+    wanted = dataclasses.replace(
+        wanted,
+        seed=7,
+        gait=dataclasses.replace(wanted.gait, random_phase=not wanted.gait.random_phase),
+        network=dataclasses.replace(wanted.network, actor=(8, 4), estimator=()),
+        ppo=dataclasses.replace(wanted.ppo, learning_rate_bounds=(1e-6, 1e-2)),
+        run=dataclasses.replace(wanted.run, steps=12345),
+    )
+    options = config_lib.options(wanted)
+    parsed = train.parse(options).config
+    assert parsed == wanted and parsed.run == wanted.run
+    assert options[:2] == ["--preset", name] or without
+
+
+def test_options_name_only_what_differs():
+    debug = preset("debug")
+    assert config_lib.options(debug) == ["--preset", "debug"]
+    faster = dataclasses.replace(debug, ppo=dataclasses.replace(debug.ppo, learning_rate=1e-4))
+    assert config_lib.options(faster) == ["--preset", "debug", "--ppo.learning-rate", "0.0001"]

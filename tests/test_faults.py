@@ -1,6 +1,7 @@
 """Faults in a training: bad numbers, full disks, damaged files, a second process in its folder."""
 
 import ast
+import asyncio
 import contextlib
 import dataclasses
 import functools
@@ -9,10 +10,12 @@ import os
 import pickle
 import re
 import resource
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -208,7 +211,8 @@ def training(state_at, tmp_path, monkeypatch):
                 state = poison(state)
                 finite = rollout.finite(state.learner.params)
                 skipped = jnp.isinf(state.learner.learning_rate)
-                metrics = METRICS | {"finite": finite, "ppo/skipped": skipped}
+                broken = run.broken(int(state.step))
+                metrics = METRICS | {"finite": finite, "ppo/skipped": skipped, "broken": broken}
                 return state.replace(step=state.step + 1), metrics
 
         monkeypatch.setattr(train_step, "make", lambda config: (lambda: state_at(0), Step()))
@@ -216,6 +220,7 @@ def training(state_at, tmp_path, monkeypatch):
         return train.main(["--preset", "debug", "--run-dir", str(run.dir), *often])
 
     run.dir = tmp_path / "r"
+    run.broken = lambda step: 0.0  # share of the samples, after so many train steps
     return run
 
 
@@ -311,6 +316,214 @@ class TestGoingBack:
         (tmp_path / "x.npz").write_bytes(pickle.dumps("no dump"))
         assert doctor.main(["replay", str(tmp_path / "x.npz")]) == 2
         assert "is no dump" in capsys.readouterr().err
+
+
+class TestBrokenSamples:
+    """Many are said, and all of them for long end a training; both patience 10 train steps."""
+
+    LONG = ("--steps", 40 * 128)
+
+    def test_ten_train_steps_with_many_are_said_once(self, training, capsys):
+        training.broken = lambda step: 0.02 if 5 <= step < 30 else 0.01
+        assert training(lambda state: state, *self.LONG) == 0
+        out = capsys.readouterr().out
+        assert out.count("warning: ") == 1 and "done: 40 train steps" in out
+        assert "in each of the last 10 train steps more than 1% of the samples were broken" in out
+        assert "2.0% in the last one" in out
+
+    def test_a_second_spell_is_said_again(self, training, capsys):
+        training.broken = lambda step: 0.0 if step == 15 else 0.5
+        assert training(lambda state: state, *self.LONG) == 0
+        assert capsys.readouterr().out.count("warning: ") == 2
+
+    def test_nine_are_not(self, training, capsys):
+        training.broken = lambda step: 0.0 if step % 10 == 9 else 0.99
+        assert training(lambda state: state, *self.LONG) == 0
+        assert "warning" not in capsys.readouterr().out
+
+    def test_all_for_long_end_it_with_one_line(self, training, capsys):
+        training.broken = lambda step: 1.0 if step >= 5 else 0.0
+        assert training(lambda state: state, *self.LONG) == 1
+        said = capsys.readouterr()
+        assert "every sample was broken in 10 train steps; back to train step 5" in said.out
+        (line,) = said.err.splitlines()
+        assert line.startswith("error: every sample was broken in 10 train steps, also after 3")
+        assert Store(training.dir).steps()[-1] == 5, "a state that learnt nothing was saved"
+        assert int(recovery.read_dump(training.dir / files.BAD_STATE)[1].step) == 5
+
+    def test_a_short_training_is_not_done_either(self, training, capsys):
+        training.broken = lambda step: 1.0
+        assert training(lambda state: state) == 1
+        said = capsys.readouterr()
+        assert (
+            said.err == "error: every sample was broken in all 8 train steps: nothing is learnt\n"
+        )
+        assert "done" not in said.out and Store(training.dir).steps() == [8]
+
+    def test_the_last_steps_alone_are_no_failure(self, training, capsys):
+        training.broken = lambda step: 1.0 if step >= 5 else 0.0
+        assert training(lambda state: state) == 0
+        assert "done: 8 train steps" in capsys.readouterr().out
+
+
+# ----------------------------------------------------------------------------------- circumstances
+
+
+class TestAround:
+    """Where a training runs makes no difference to it."""
+
+    @staticmethod
+    def closed_output(monkeypatch):
+        reader, writer = os.pipe()
+        stream = os.fdopen(writer, "w")
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setattr(sys, "__stdout__", stream)
+        return reader
+
+    def test_its_output_is_closed_on_the_way(self, training, monkeypatch):
+        """`| head -n 2`, a pager that is left, tee at Ctrl-C."""
+        reader = self.closed_output(monkeypatch)
+
+        def poison(state):
+            if int(state.step) == 3:
+                os.close(reader)
+            return state
+
+        assert training(poison) == 0
+        assert steps_of(training.dir) == list(range(1, 9))
+        assert Store(training.dir).steps()[-1] == 8
+
+    def test_stopped_with_its_output_closed(self, training, monkeypatch):
+        os.close(self.closed_output(monkeypatch))
+
+        def poison(state):
+            if int(state.step) == 3:
+                signal.raise_signal(signal.SIGHUP)
+            return state
+
+        assert training(poison) == 0
+        assert Store(training.dir).steps()[-1] == 4
+
+    @pytest.mark.parametrize("name", ["SIGHUP", "SIGUSR1"])
+    def test_warnings_stop_like_sigterm(self, name, training, capsys):
+        def poison(state):
+            if int(state.step) == 3:
+                signal.raise_signal(getattr(signal, name))
+            return state
+
+        assert training(poison) == 0
+        assert f"stopped by {name} at train step 4, saved" in capsys.readouterr().out
+        assert Store(training.dir).steps()[-1] == 4
+
+    def test_in_a_thread(self, training, capsys):
+        codes = []
+        thread = threading.Thread(target=lambda: codes.append(training(lambda state: state)))
+        thread.start()
+        thread.join()
+        assert codes == [0] and "done: 8 train steps" in capsys.readouterr().out
+
+    def test_in_a_notebooks_cell_twice(self, training, capsys):
+        """A cell runs within an event loop; its output has no file descriptor."""
+
+        async def cell():
+            first = training(lambda state: state)
+            return first, training(lambda state: state, "--resume", "--steps", 1280)
+
+        assert asyncio.run(cell()) == (0, 0)
+        assert "done: 10 train steps" in capsys.readouterr().out
+        assert steps_of(training.dir) == list(range(1, 11))
+
+
+def files_of(folder):
+    """What every file of a folder holds, locks apart."""
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
+
+
+class TestResume:
+    """What --resume says, and what it keeps."""
+
+    @pytest.fixture
+    def done(self, training, capsys):
+        """Goes on with a training of 8 train steps, 1024 environment steps; what it says."""
+        assert training(lambda state: state) == 0
+
+        def resume(*args, code=0):
+            capsys.readouterr()
+            assert training(lambda state: state, "--resume", *args) == code
+            said = capsys.readouterr()
+            return said.err if code else said.out
+
+        resume.dir = training.dir
+        return resume
+
+    @pytest.mark.parametrize(
+        ("steps", "says"),
+        [
+            (100, "has done 1024 environment steps, more than the 100 that --steps asks for"),
+            ("1024", "has done 1024 environment steps, all of the 1024 that --steps asks for"),
+        ],
+    )
+    def test_nothing_is_left_to_do(self, steps, says, done):
+        before = files_of(done.dir)
+        out = done("--steps", steps)
+        assert "nothing to do: " in out and says in out
+        assert "compiled" not in out and "done:" not in out
+        assert files_of(done.dir) == before
+
+    @pytest.mark.parametrize(
+        ("change", "says"),
+        [
+            (["--ppo.learning-rate", "3e-4"], "ppo.learning_rate is 1e-05 in the run that is"),
+            (["--env.num-envs", "32"], "env.num_envs is 16 in the run that is there, not 32"),
+            (["--seed", "5"], "seed is 0 in the run that is there, not 5"),
+            (["--env.frames", "4"], "env.frames is 3 in the run that is there, not 4"),
+        ],
+    )
+    def test_another_config_names_the_command(self, change, says, done, monkeypatch):
+        """What is to be typed gives the config that was asked for."""
+        before = files_of(done.dir)
+        line = done(*change, code=2)
+        assert says in line and len(line.splitlines()) == 1
+        command = shlex.split(line.rpartition(": ")[2])
+        assert command[:3] == ["python", "-m", "kslc_jax.train"]
+        args = train.parse(command[3:])
+        assert args.config == train.parse(["--preset", "debug", *change]).config
+        assert args.run_dir == done.dir.with_name("r-2") and not args.run_dir.exists()
+        same_networks = "--env.frames" not in change
+        assert args.start_from == (done.dir if same_networks else None)
+        assert files_of(done.dir) == before
+
+    def test_other_versions(self, done, monkeypatch):
+        path = done.dir / "versions.json"
+        first = json.loads(path.read_text())
+        assert first["engine"] == "mujoco" and first["devices"] == 1
+        old = first | {"jax": "0.8.0", "python": "3.10.1", "engine": "mjx", "devices": 4}
+        path.write_text(json.dumps(old))
+        line = done("--steps", 1152).splitlines()[0]
+        assert line.startswith("resuming with ") and "(bits may differ from here)" in line
+        for said in (
+            f"jax {first['jax']} instead of 0.8.0",
+            f"python {first['python']} instead of 3.10.1",
+            "engine mujoco instead of mjx",
+            "devices 1 instead of 4",
+        ):
+            assert said in line
+        kept = json.loads(path.read_text())
+        (news,) = kept.pop("resumed")
+        assert kept == old
+        changed = ("jax", "python", "engine", "devices")
+        assert news == {"train_step": 8} | {name: first[name] for name in changed}
+        assert done("--steps", 1280).startswith("resuming: ")  # as the last time
+        assert len(json.loads(path.read_text())["resumed"]) == 1
+
+    @pytest.mark.parametrize("content", [None, "{", "[]", '{"resumed": 3}', '{"jax": "0.8.0"}'])
+    def test_versions_that_say_less(self, content, done):
+        """Older runs name fewer; the file may be damaged. No number depends on it."""
+        path = done.dir / "versions.json"
+        path.unlink() if content is None else path.write_text(content)
+        out = done("--steps", 1152)
+        assert out.startswith("resuming with jax" if content and "jax" in content else "resuming: ")
+        assert json.loads(path.read_text())["resumed"][0]["jax"] == jax.__version__
 
 
 # ------------------------------------------------------------------------------------- full disks

@@ -147,7 +147,10 @@ def unkilled(tmp_path_factory):
     "sig",
     [
         signal.SIGKILL,
-        pytest.param(signal.SIGTERM, marks=pytest.mark.slow(reason="half a minute, like SIGKILL")),
+        *(
+            pytest.param(s, marks=pytest.mark.slow(reason="half a minute, like SIGKILL"))
+            for s in (signal.SIGTERM, signal.SIGHUP)
+        ),
     ],
 )
 def test_killed_run_resumes_with_the_same_numbers(sig, unkilled, tmp_path):
@@ -173,17 +176,6 @@ def test_killed_run_resumes_with_the_same_numbers(sig, unkilled, tmp_path):
     until = steps[-1] + 5
     cli("--resume", "--run-dir", run_dir, "--steps", until * 128)
     assert numbers(records(run_dir)) == unkilled[:until]
-
-
-def test_first_signal_asks_second_interrupts():
-    with loop._Stop() as stop:
-        signal.raise_signal(signal.SIGINT)
-        assert stop.requested == "SIGINT"
-        signal.raise_signal(signal.SIGTERM)  # soon after the first: counts as the same request
-        assert stop.requested == "SIGINT"
-        stop._since -= loop.SAME_SIGNAL_SECONDS
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
 
 
 def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):

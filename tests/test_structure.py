@@ -30,7 +30,18 @@ OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "vise
 OPTIONAL |= {"kslc_jax.viewer.panel": "viser"}
 """Modules that need an optional package, with its name."""
 
-LIGHT = ("config", "robots", "errors", "files", "cli", "train", "evaluate", "sim2sim", "play")
+LIGHT = (
+    "config",
+    "robots",
+    "errors",
+    "files",
+    "streams",
+    "cli",
+    "train",
+    "evaluate",
+    "sim2sim",
+    "play",
+)
 LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "evaluation.tables")
 """Modules that do not import JAX, so that a config check and `--help` are quick."""
 

@@ -23,7 +23,7 @@ from kslc_jax import config, curriculum, files, networks, play, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import trials
-from kslc_jax.viewer import session
+from kslc_jax.viewer import following, session
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
@@ -272,6 +272,91 @@ def test_switching_policy(viewer):
     assert viewer.session.policy.step == 2
 
 
+# ---------------------------------------------------------------------------------------- following
+
+
+@pytest.fixture
+def training(run_dir, still, tmp_path):
+    """A run folder as a training fills it: the checkpoints 2 and 10; it keeps more on request."""
+    folder = tmp_path / "r"
+    shutil.copytree(run_dir, folder)
+    (folder / files.CONFIG).write_text("{}")
+
+    def keep(kind, step):
+        reached = still.curriculum.replace(v_max=step / 10)
+        policy = dataclasses.replace(still, curriculum=reached, step=step)
+        policy_lib.save_policy(policy, folder / kind / str(step))
+
+    keep.folder = folder
+    return keep
+
+
+def test_each_new_policy_is_named_once(training):
+    follower = following.Follower(training.folder)
+    checkpoints, snapshots = (training.folder / x for x in (files.CHECKPOINTS, files.SNAPSHOTS))
+    assert follower.fresh(0.0) == checkpoints / "10"
+    training(files.SNAPSHOTS, 12)
+    assert follower.fresh(0.5) is None  # it looks once a second
+    assert follower.fresh(1.5) == snapshots / "12"
+    assert follower.fresh(3.0) is None
+    training(files.CHECKPOINTS, 12)
+    assert follower.fresh(4.5) is None  # the same policy
+    (checkpoints / "14.orbax-checkpoint-tmp-1" / "params").mkdir(parents=True)
+    assert follower.fresh(6.0) is None  # half-written
+    training(files.CHECKPOINTS, 14)
+    assert follower.fresh(7.5) == checkpoints / "14"
+    shutil.rmtree(checkpoints / "14")  # the training has gone back
+    assert follower.fresh(9.0) == snapshots / "12"
+
+
+def test_following_waits_for_the_first_checkpoint(training, capsys, monkeypatch):
+    hidden = training.folder / "hidden"
+    (training.folder / files.CHECKPOINTS).rename(hidden)
+    training(files.SNAPSHOTS, 1)
+    naps = []
+
+    def sleep(seconds):
+        naps.append(seconds)
+        if len(naps) == 3:
+            hidden.rename(training.folder / files.CHECKPOINTS)
+
+    monkeypatch.setattr(following, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(following.time, "sleep", sleep)
+    assert following.Follower(training.folder).wait().name == "10"
+    assert len(naps) == 3 and capsys.readouterr().out.count("waiting for the first") == 1
+
+
+def test_the_robot_goes_on_with_a_newer_policy(viewer, training, monkeypatch):
+    monkeypatch.setattr(viewer, "_follower", following.Follower(training.folder))
+    viewer.panel.policy.value = viewer._given
+    viewer.frame(0.0)
+    assert viewer.session.policy.step == 10
+    for _ in range(5):
+        viewer.session.advance(np.zeros(3))
+    before = viewer.session.view
+    training(files.SNAPSHOTS, 20)
+    viewer.frame(2.0)
+    assert viewer.session.policy.step == 20 and viewer.session.view is before
+    assert viewer.panel._sliders[0].max == pytest.approx(2.5)  # v_max and a margin
+    viewer.panel.policy.value = "step 2"  # chosen by hand: it stays
+    viewer.frame(4.0)
+    training(files.SNAPSHOTS, 30)
+    viewer.frame(6.0)
+    assert viewer.session.policy.step == 2
+    viewer.panel.policy.value = viewer._given
+    viewer.frame(8.0)
+    assert viewer.session.policy.step == 30
+
+
+def test_a_policy_that_is_gone_again_is_left_out(viewer, training, monkeypatch):
+    monkeypatch.setattr(viewer, "_follower", following.Follower(training.folder))
+    step = viewer.session.policy.step
+    training(files.SNAPSHOTS, 40)
+    shutil.rmtree(training.folder / files.SNAPSHOTS / "40" / "meta")
+    viewer.frame(10.0)
+    assert viewer.session.policy.step == step
+
+
 # --------------------------------------------------------------------------------------------- CLI
 
 
@@ -297,6 +382,8 @@ def test_viewer_not_installed_is_one_line(run_dir, capsys, monkeypatch):
         (["no-such-policy"], "no run, checkpoint or shipped policy"),
         (["x", "--port", "70000"], "port must lie in"),
         (["x", "--seconds", "0"], "seconds must be positive"),
+        (["x", "--follow", "--video", "x.mp4"], "follow is for the live viewer"),
+        (["xbot_l_run", "--follow"], "xbot_l_run is no run folder of a training"),
         (["x", "--engine", "drake"], "engine: drake is for --gait-strip and --video only"),
     ],
 )

@@ -8,6 +8,7 @@ paper builds on it, and it decides what the paper leaves open. docs/fidelity.md 
 departure from them.
 """
 
+from kslc_jax.config.options import options
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
@@ -55,6 +56,7 @@ __all__ = [
     "RewardWeights",
     "RunConfig",
     "from_dict",
+    "options",
     "preset",
     "require_seed",
     "to_dict",

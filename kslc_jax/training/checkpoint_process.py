@@ -24,6 +24,7 @@ from kslc_jax.config import Config
 from kslc_jax.policy import Policy
 from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
+from kslc_jax.training import stopping
 from kslc_jax.training.checkpoint import Store
 
 
@@ -145,7 +146,7 @@ def _serve(pipe: Connection) -> None:
     runtime.prepare(gl=False)
     runtime.quiet()
     jax.config.update("jax_platforms", "cpu")  # the accelerator is the training's
-    for number in (signal.SIGINT, signal.SIGTERM):  # a terminal sends them to both
+    for number in stopping.SIGNALS:  # terminals and schedulers signal this process, too
         signal.signal(number, signal.SIG_IGN)
     server = _Server()
     with contextlib.suppress(EOFError, OSError):

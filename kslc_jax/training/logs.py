@@ -1,4 +1,4 @@
-"""What a person sees of a training: JSONL and TensorBoard files, and progress on the terminal."""
+"""The records of a training: JSONL and TensorBoard files, and progress on the terminal."""
 
 import contextlib
 import json
@@ -32,14 +32,14 @@ def rows_written(run_dir: Path) -> int:
 class MetricsFile:
     """metrics.jsonl (one record a line) and TensorBoard events of one run folder.
 
-    Going on from train step `after` drops the records that lie behind it: the resumed run writes
-    them again. A full disk is told through `warn`, once; records wait until there is room.
+    Records after train step `after` are dropped: the resumed run writes them again. A full disk is
+    told by `warn`, once; records wait until there is room.
     """
 
     def __init__(self, run_dir: Path, after: int = 0, warn: Callable[[str], None] = print):
         self.path = run_dir / files.METRICS
         self.seconds_before = 0.0
-        """Wall time [s] that the kept records have seen."""
+        """Wall time [s] at the last kept record."""
         kept = []
         if self.path.exists():
             lines = self.path.read_text(errors="replace").splitlines()
@@ -53,7 +53,7 @@ class MetricsFile:
         self._warn, self._full = warn, False
 
     def write(self, record: dict[str, float]) -> None:
-        """Appends one record; on disk at once."""
+        """Appends one record to the disk at once."""
         self._waiting += (json.dumps(record) + "\n").encode()
         try:
             self._flush()
@@ -65,13 +65,13 @@ class MetricsFile:
             self._full = True
 
     def _flush(self) -> None:
-        """Writes what fits; a line that is torn by a full disk is completed later."""
+        """Writes as much as fits; a line that a full disk cuts off is completed later."""
         while self._waiting:
             self._waiting = self._waiting[self._file.write(self._waiting) :]
 
     def close(self) -> None:
-        """Flushes both."""
-        with contextlib.suppress(OSError):  # said before
+        """Writes what is left to both."""
+        with contextlib.suppress(OSError):  # already reported
             self._flush()
         with contextlib.suppress(OSError):
             self._board.close()
@@ -79,8 +79,10 @@ class MetricsFile:
 
 
 class _Board:
-    """TensorBoard events. Written in this thread: the one of tensorboardX's SummaryWriter dies of a
-    full disk, and the training would then wait for it for ever."""
+    """TensorBoard events, written in this thread.
+
+    tensorboardX's SummaryWriter has a thread that dies when the disk is full; the training would
+    then wait for it for ever."""
 
     def __init__(self, folder: Path, after: int):
         folder.mkdir(exist_ok=True)
@@ -91,11 +93,10 @@ class _Board:
         self._events.write_event(event_pb2.Event(step=after + 1, session_log=session))
 
     def write(self, record: dict[str, float]) -> None:
-        """One record, over its env_steps; what is not finite is left out."""
+        """Writes the finite values of one record over its env_steps."""
         values = [
             Summary.Value(tag=name, simple_value=value)
-            for name, value in record.items()
-            if math.isfinite(value)
+            for name, value in finite_values(record).items()
         ]
         step = int(record["env_steps"])
         event = event_pb2.Event(wall_time=time.time(), step=step, summary=Summary(value=values))
@@ -103,12 +104,17 @@ class _Board:
         self._events.flush()
 
     def close(self) -> None:
-        """Flushes."""
+        """Writes what is left."""
         self._events.close()
 
 
+def finite_values(record: dict[str, float]) -> dict[str, float]:
+    """The values of a record that a curve can show."""
+    return {name: value for name, value in record.items() if math.isfinite(value)}
+
+
 def _step(line: str) -> int:
-    """Train step of a record; a torn last line counts as behind everything."""
+    """Train step of a record; that of a line that is cut off is larger than any other."""
     try:
         return int(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):
@@ -116,13 +122,13 @@ def _step(line: str) -> int:
 
 
 def duration(seconds: float) -> str:
-    """h:mm:ss."""
+    """A time [s] as h:mm:ss."""
     minutes, s = divmod(int(max(seconds, 0)), 60)
     return f"{minutes // 60}:{minutes % 60:02d}:{s:02d}"
 
 
 class Progress:
-    """Live table on a terminal, a line every few seconds elsewhere."""
+    """Shows a live table on a terminal, and a line every few seconds elsewhere."""
 
     def __init__(self, config: Config, console: Console | None = None):
         self.config = config
@@ -131,11 +137,11 @@ class Progress:
         self._printed = 0.0
 
     def say(self, message: str) -> None:
-        """One line above the progress."""
+        """Prints one line above the table."""
         self.console.print(message, markup=False)
 
     def warn(self, message: str) -> None:
-        """Something that training goes on in spite of."""
+        """Prints a warning; the training goes on."""
         self.say(f"warning: {message}")
 
     def show(self, record: dict[str, float]) -> None:
@@ -155,7 +161,7 @@ class Progress:
             self._live.stop()
 
     def _headline(self, r: dict[str, float]) -> dict[str, str]:
-        """What matters most, by name."""
+        """The most important values, by name."""
         left = (self.config.run.steps - r["env_steps"]) / max(r["steps_per_second"], 1e-9)
         return {
             "steps": f"{r['env_steps'] / 1e6:.2f}M/{self.config.run.steps / 1e6:.1f}M",
@@ -173,7 +179,7 @@ class Progress:
         return "  ".join(f"{name} {value}" for name, value in self._headline(record).items())
 
     def _table(self, record: dict[str, float]) -> Table:
-        """Headline beside the reward terms with their weights; fits into 80 columns."""
+        """The headline beside the reward terms and their weights, in 80 columns."""
         head = Table.grid(padding=(0, 1))
         for name, value in self._headline(record).items():
             head.add_row(name, f"[bold]{value}")

@@ -1,20 +1,18 @@
 """The host's loop around the jitted train step: stepping, going back, stopping.
 
-Everything that decides a number is in `train_step`; this file only calls it, reads its metrics, has
-them kept, and stops. Of several processes each runs this loop; what one of them alone can know (a
-signal, the clock, what is on the disk) they tell each other through `devices`.
+`train_step` decides all numbers. This file calls it, reads its metrics, saves, and stops. With
+several processes each one runs this loop. What only one of them knows (a signal, the time, the
+contents of the disk) it tells the others through `devices`.
 """
 
 import contextlib
 import functools
 import os
 import shlex
-import signal
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import jax
@@ -27,43 +25,18 @@ from kslc_jax.networks import Params
 from kslc_jax.policy import policy_name
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
-from kslc_jax.training import devices, memory, profiling, recovery
+from kslc_jax.training import devices, memory, profiling, recovery, run_folder, wandb_run
 from kslc_jax.training.checkpoint_process import ChildProcessStorage, LocalStorage
 from kslc_jax.training.logs import Progress
 from kslc_jax.training.recorder import NullRecorder, Record, Recorder, snapshot_due
 from kslc_jax.training.recovery import NonFiniteState, NumbersError, NumericsCheck
 from kslc_jax.training.run_folder import locked, open_folder, writing
-
-SAME_SIGNAL_SECONDS = 1.0
-"""Seconds within which signals count as one: a scheduler that signals every process of a job tells
-a training twice, itself and by way of what started it."""
-
-
-class _Stop:
-    """Turns the first SIGINT or SIGTERM into a request that the loop reads between steps."""
-
-    def __init__(self) -> None:
-        self.requested: str | None = None
-        self._since = 0.0
-
-    def __enter__(self) -> "_Stop":
-        self._old = {s: signal.signal(s, self._handle) for s in (signal.SIGINT, signal.SIGTERM)}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._old.items():
-            signal.signal(number, handler)
-
-    def _handle(self, number: int, _: FrameType | None) -> None:
-        if not self.requested:
-            self.requested, self._since = signal.Signals(number).name, time.monotonic()
-        elif time.monotonic() - self._since > SAME_SIGNAL_SECONDS:  # a second one means now
-            raise KeyboardInterrupt
+from kslc_jax.training.stopping import stop_requests
 
 
 @dataclass(frozen=True)
 class _Job:
-    """One training: what, where, on what, and who says and keeps what."""
+    """One training: its config, folder and devices, its output, and its compiled functions."""
 
     config: Config
     run_dir: Path
@@ -90,22 +63,25 @@ def train(
     start_from: Path | None = None,
     mesh: Mesh | None = None,
     profile: int = 0,
+    wandb: bool = False,
 ) -> TrainState:
-    """Trains until `config.run.steps` or a signal, and saves the state; every few minutes too.
+    """Trains until `config.run.steps` or a signal. Saves the state then, and every few minutes.
 
     Args:
-      config: what to train.
-      run_dir: where everything goes; of several processes only the first one's matters.
+      config: the training's config.
+      run_dir: the run folder; with several processes only that of the first one counts.
       resume: go on from the run folder's latest checkpoint.
-      progress: shows it.
+      progress: shows the metrics and says what happens.
       start_from: a policy whose networks and curriculum a new training begins with.
-      mesh: the devices of all processes, see `devices.mesh`; one device without.
+      mesh: the devices of all processes, see `devices.mesh`; None for one device.
       profile: train steps to trace, see `profiling`.
+      wandb: send the records to Weights & Biases as well, see `wandb_run`.
 
     Raises:
       RunError, ConfigError, CheckpointError: it cannot start, or its last state cannot be saved.
-      NumbersError: numbers went bad again and again.
-      Elsewhere: one of these in the first process, where this is another.
+      MissingPackage, UserError: `wandb` is asked for and not there, or refuses.
+      NumbersError: numbers went bad again and again, or nothing was learnt at all.
+      Elsewhere: the first process raised one of these, and this is another process.
     """
     init, step = train_step.make(config) if mesh is None else devices.make(config, mesh)
     like = jax.eval_shape(init)
@@ -119,9 +95,10 @@ def train(
         origin: dict[str, str] = {}
         if start_from is not None:
             init, origin = _starting_from(start_from, config, init, storage, mesh)
+        facts = run_folder.circumstances(config, 1 if mesh is None else mesh.size) | origin
         recorder = devices.on_first(
             lambda: stack.enter_context(
-                _recorder(config, run_dir, resume, origin, progress, storage)
+                _recorder(config, run_dir, resume, facts, progress, storage, wandb)
             )
         )
         tracing = profiling.Profile(
@@ -141,20 +118,24 @@ def _recorder(
     config: Config,
     run_dir: Path,
     resume: bool,
-    origin: dict[str, str],
+    facts: dict[str, Any],
     progress: Progress,
     storage: LocalStorage,
+    wandb: bool,
 ) -> Generator[Recorder]:
-    """Opens the run folder, which is this process's alone meanwhile."""
+    """Opens the run folder and locks it for this process."""
+    if wandb:
+        wandb_run.package()  # before anything is written
     if not resume:
         with writing(run_dir):
             run_dir.mkdir(parents=True, exist_ok=True)
-    with locked(run_dir):
-        open_folder(run_dir, config, resume, origin)
+    with locked(run_dir), contextlib.ExitStack() as stack:
+        open_folder(run_dir, config, resume, facts)
         with writing(run_dir):
-            store = storage.open(run_dir, config)
-        with contextlib.closing(store):
-            yield Recorder(config, run_dir, store, progress, storage.save_policy)
+            store = stack.enter_context(contextlib.closing(storage.open(run_dir, config)))
+        online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if wandb else None
+        run = stack.enter_context(online) if online else None
+        yield Recorder(config, run_dir, store, progress, storage.save_policy, run)
 
 
 def _starting_from(
@@ -164,7 +145,7 @@ def _starting_from(
     storage: LocalStorage,
     mesh: Mesh | None,
 ) -> tuple[Callable[[], TrainState], dict[str, str]]:
-    """`init` with a policy's networks and curriculum, and where they come from."""
+    """`init` with a policy's networks and curriculum, and a note of their origin."""
     start = functools.partial(train_step.start_from, config)
     like = jax.eval_shape(init)
     step = 0
@@ -192,9 +173,12 @@ def _starting_from(
 
 
 def _train(job: _Job) -> TrainState:
-    """Compiles and trains; goes back to a checkpoint where numbers are not finite."""
+    """Compiles and trains; goes back to a checkpoint if numbers are not finite."""
     start = time.monotonic()
     state = job.restored() if job.resume else job.init()
+    if job.resume and int(state.step) >= job.config.num_updates:
+        job.progress.say(_nothing_to_do(job, int(state.step)))
+        return state
     if job.resume:
         job.progress.say(f"resumed at train step {int(state.step)}")
     compiled = job.step.lower(job.like).compile()
@@ -212,11 +196,12 @@ def _train(job: _Job) -> TrainState:
 
 
 def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tuple[TrainState, int]:
-    """The state of the last checkpoint with a lower learning rate, and the number of this attempt
-    from there; `attempt` is the number of the last one, from train step `back_to`.
+    """The state of the last checkpoint with a lower learning rate, and the number of this attempt.
+
+    `attempt` is the number of the last attempt; it started from train step `back_to`.
 
     Raises:
-      NumbersError: all attempts from there failed; the message says what is left to look at.
+      NumbersError: all attempts from this checkpoint failed; the message names the dump.
     """
     before = devices.whole(bad.before)
     state = _last_good(job)
@@ -237,7 +222,7 @@ def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tupl
 
 
 def _last_good(job: _Job) -> TrainState:
-    """The state of the last checkpoint, or the first state where there is none."""
+    """The state of the last checkpoint, or the first state if there is none."""
     job.recorder.settle()
     (there,) = devices.agree(job.recorder.has_checkpoints())
     state = job.restored() if there else job.init()
@@ -246,11 +231,11 @@ def _last_good(job: _Job) -> TrainState:
 
 
 def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
-    """Steps; returns the last state, which is kept."""
+    """Trains step by step; returns the last state, which is saved."""
     first = int(state.step)
     record: Record = {}
     numerics, watchdog = NumericsCheck(state), Watchdog()
-    with _Stop() as stop, contextlib.ExitStack() as opened:
+    with stop_requests() as stop, contextlib.ExitStack() as opened:
         devices.on_first(lambda: opened.enter_context(job.recorder.at(first)))
         for step in range(first + 1, job.config.num_updates + 1):
             numerics.before(state)
@@ -260,7 +245,8 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
                 record = {name: float(value) for name, value in jax.device_get(metrics).items()}
                 took = time.monotonic() - tick
             record = job.recorder.log(record, step, took)
-            numerics.after(record)
+            if warning := numerics.after(record):
+                job.progress.warn(warning)
             if numerics.good and snapshot_due(job.config, step):
                 job.recorder.keep_snapshot(state)
             stopped, due = devices.agree(stop.requested is not None, job.recorder.due())
@@ -273,6 +259,8 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
         if record and numerics.finite:
             last = devices.whole(state)
             devices.on_first(lambda: job.recorder.finish(last, record))
+    if not stop.requested:
+        numerics.require_some_good()
     _farewell(job, int(state.step), stop.requested, numerics.finite)
     return state
 
@@ -288,8 +276,17 @@ def _farewell(job: _Job, step: int, stopped_by: str | None, whole: bool) -> None
         job.progress.say(f"done: {job.config.num_updates} train steps, {saved} in {job.run_dir}")
 
 
+def _nothing_to_do(job: _Job, step: int) -> str:
+    past = step > job.config.num_updates
+    return (
+        f"nothing to do: {job.run_dir} has done {step * job.config.batch_size} environment steps, "
+        f"{'more than' if past else 'all of'} the {job.config.run.steps} that --steps asks for; "
+        "it counts from the beginning of the run. Nothing is changed"
+    )
+
+
 def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
-    """One paragraph on what is about to run."""
+    """One paragraph about the training that is about to run."""
     n, t = config.env.num_envs, config.ppo.rollout_steps
     engine, kind = physics.resolve_engine(config.physics), jax.devices()[0].device_kind
     count = 1 if mesh is None else mesh.size

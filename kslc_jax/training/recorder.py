@@ -1,7 +1,7 @@
-"""What the host keeps of a training: metrics, checkpoints, and policies on the way.
+"""Keeps the results of a training: metrics, checkpoints, and snapshots of the policy.
 
-Of several processes only the first keeps anything; the others have a `NullRecorder`, so that the
-loop reads the same.
+With several processes only the first one keeps anything. The others have a `NullRecorder`, so that
+all run the same loop.
 """
 
 import contextlib
@@ -21,6 +21,7 @@ from kslc_jax.training.checkpoint import BEST_METRIC
 from kslc_jax.training.checkpoint_process import CheckpointStore
 from kslc_jax.training.logs import MetricsFile, Progress
 from kslc_jax.training.run_folder import writing
+from kslc_jax.training.wandb_run import WandbRun
 
 Record = dict[str, float]
 
@@ -29,46 +30,46 @@ class NullRecorder:
     """Keeps nothing."""
 
     def at(self, step: int) -> contextlib.AbstractContextManager[None]:
-        """Around a loop that begins after train step `step`."""
+        """Context of a loop that begins after train step `step`."""
         return contextlib.nullcontext()
 
     def log(self, metrics: Record, step: int, took: float) -> Record:
-        """Shows and writes the metrics of a train step that took so many seconds."""
+        """Shows and writes the metrics of a train step that took `took` seconds."""
         return metrics
 
     def has_checkpoints(self) -> bool:
-        """Whether there is one to go back to."""
+        """True if there is a checkpoint to go back to."""
         return False
 
     def restore(self, like: TrainState) -> TrainState:
-        """The latest whole checkpoint; CheckpointError where there is none."""
+        """The latest whole checkpoint; CheckpointError if there is none."""
         raise NotImplementedError
 
     def due(self) -> bool:
-        """Whether it is time for a checkpoint."""
+        """True if it is time for a checkpoint."""
         return False
 
     def save(self, state: TrainState, record: Record) -> None:
         """Writes a checkpoint in the background."""
 
     def keep_snapshot(self, state: TrainState) -> None:
-        """CheckpointStore the policy alone."""
+        """Writes the policy alone."""
 
     def drop_snapshots(self, after: int) -> None:
-        """Removes policies of train steps that a training went back behind."""
+        """Removes snapshots of train steps after `after`: the training has gone back to it."""
 
     def settle(self) -> None:
-        """Blocks until the last save is on disk, or has failed: training goes on."""
+        """Blocks until the last save is on disk or has failed; the training goes on either way."""
 
     def finish(self, state: TrainState, record: Record) -> None:
         """Writes the last checkpoint and waits for it."""
 
 
 class Recorder(NullRecorder):
-    """Keeps everything of one run folder, and shows it.
+    """Writes everything into one run folder, and shows it.
 
-    A failed save must not end hours of training: it is told, and the next one tries again. Only
-    the last one raises a CheckpointError.
+    A failed save must not end hours of training: it gives a warning, and the next one tries again.
+    Only the last save raises a CheckpointError.
     """
 
     def __init__(
@@ -78,16 +79,17 @@ class Recorder(NullRecorder):
         store: CheckpointStore,
         progress: Progress,
         save_policy: Callable[[Policy, Path], None] = policy.save_policy,
+        wandb: WandbRun | None = None,
     ):
         self._config, self._run_dir, self._store = config, run_dir, store
-        self._progress, self._save_policy = progress, save_policy
+        self._progress, self._save_policy, self._wandb = progress, save_policy, wandb
 
     @contextlib.contextmanager
     def at(self, step: int) -> Generator[None]:
         with writing(self._run_dir):
             self._file = MetricsFile(self._run_dir, step, self._progress.warn)
         self._begun = time.monotonic() - self._file.seconds_before
-        # The first train step of a new run is saved, so that whatever happens there is a way back.
+        # A new run saves its first train step, so that it can always go back.
         self._saved = time.monotonic() if self._store.steps() else -math.inf
         with contextlib.closing(self._file):
             yield
@@ -103,6 +105,8 @@ class Recorder(NullRecorder):
         }
         if step % self._config.run.log_every == 0:
             self._file.write(record)
+            if self._wandb:
+                self._wandb.write(record)
         self._progress.show(record)
         return record
 
@@ -124,7 +128,7 @@ class Recorder(NullRecorder):
         self._saved = time.monotonic()
 
     def keep_snapshot(self, state: TrainState) -> None:
-        """One that is there, from before a resume, stays."""
+        """A snapshot from before a resume stays as it is."""
         folder = self._run_dir / files.SNAPSHOTS / str(int(state.step))
         with self._going_on():
             if not folder.exists():
@@ -146,7 +150,7 @@ class Recorder(NullRecorder):
 
     @contextlib.contextmanager
     def _going_on(self) -> Generator[None]:
-        """Says that a save has failed."""
+        """Turns a failed save into a warning."""
         try:
             yield
         except CheckpointError as error:
@@ -154,6 +158,6 @@ class Recorder(NullRecorder):
 
 
 def snapshot_due(config: Config, step: int) -> bool:
-    """Whether one of `run.snapshots` equal parts of the run ends with this train step."""
+    """True if one of `run.snapshots` equal parts of the run ends with this train step."""
     parts, steps = config.run.snapshots, config.num_updates
     return step * parts // steps > (step - 1) * parts // steps

@@ -1,7 +1,7 @@
 """Numbers gone bad: when a training goes back to a checkpoint, and what it leaves when it gives up.
 
-Single environments are `train_step`'s business: it masks them and starts them anew. This file is
-about what that cannot mend: updates that are never finite, parameters that are not.
+`train_step` masks broken samples and gives their environments a new episode. This file handles what
+that cannot repair: parameters that are not finite, and updates that learn nothing.
 """
 
 import json
@@ -22,26 +22,30 @@ from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
 PATIENCE = 10
-"""Train steps in a row without one finite update, after which a training goes back."""
+"""Train steps in a row that learn nothing, after which a training goes back; also those with many
+broken samples, after which it warns."""
 
-ALL_SKIPPED = 0.9999
-"""Share of skipped gradient steps from which all were: a float32 mean of ones may be below 1."""
+ALL = 0.9999
+"""A share from here on means all: a float32 mean of ones may be below 1."""
+
+MANY = 0.01
+"""Share of broken samples above which a training warns."""
 
 ATTEMPTS = 3
-"""Times that it goes back to the same checkpoint before it gives up."""
+"""A training goes back to the same checkpoint this often before it gives up."""
 
 CAUTION = 0.5
-"""Factor on the learning rate at each of them."""
+"""Factor on the learning rate each time it goes back."""
 
 
 class NumbersError(UserError):
-    """Numbers that go bad however often the training goes back."""
+    """The numbers go bad however often the training goes back."""
 
     exit_code = 1
 
 
 class NonFiniteState(Exception):
-    """Carries what is wrong, and the state before the first bad train step."""
+    """The training cannot go on from here; carries the state before the first bad train step."""
 
     def __init__(self, why: str, before: TrainState):
         super().__init__(why)
@@ -50,21 +54,26 @@ class NonFiniteState(Exception):
 
 @jax.jit
 def _copy(state: TrainState) -> TrainState:
-    """One program; one for each of a hundred leaves would keep a GPU waiting."""
+    """Copies all leaves in one program; a program for each leaf would keep a GPU waiting."""
     return jax.tree.map(jnp.copy, state)
 
 
 class NumericsCheck:
-    """Tells from the metrics of each train step if a training's numbers are good."""
+    """Tells from the metrics of each train step if a training's numbers are good.
+
+    A bad train step leaves a learner or curriculum that is not finite, or learns nothing: none of
+    its gradients is finite, or all of its samples are broken.
+    """
 
     def __init__(self, state: TrainState):
-        self._bad_steps = 0
+        self._steps = self._bad_steps = self._many_broken = 0
         self._finite = True
+        self._why = ""
         self._before = state
 
     @property
     def good(self) -> bool:
-        """Whether the last train step learnt something, from numbers that are all finite."""
+        """True if the last train step was not bad."""
         return self._bad_steps == 0
 
     @property
@@ -73,22 +82,45 @@ class NumericsCheck:
         return self._finite
 
     def before(self, state: TrainState) -> None:
-        """Keeps a copy, for the step donates `state`; during bad steps the one before them."""
+        """Keeps a copy, because the step donates `state`; during bad steps the one before them."""
         if self.good:
             self._before = _copy(state)
 
-    def after(self, metrics: dict[str, float]) -> None:
-        """Counts bad train steps in a row."""
+    def after(self, metrics: dict[str, float]) -> str:
+        """Takes in the metrics of a train step; returns a warning, or nothing."""
+        self._steps += 1
         self._finite = metrics["finite"] == 1.0
-        learnt = metrics["ppo/skipped"] < ALL_SKIPPED
-        self._bad_steps = 0 if self._finite and learnt else self._bad_steps + 1
+        self._why = _nothing_learnt(metrics)
+        self._bad_steps = self._bad_steps + 1 if self._why or not self._finite else 0
+        self._many_broken = self._many_broken + 1 if metrics["broken"] > MANY else 0
+        if self._many_broken != PATIENCE or self._bad_steps == PATIENCE:
+            return ""
+        return (
+            f"in each of the last {PATIENCE} train steps more than {MANY:.0%} of the samples were "
+            f"broken, {metrics['broken']:.1%} in the last one: numbers that are not finite, or a "
+            "physics that diverges; nothing is learnt from them (metric `broken`)"
+        )
 
     def require_good(self) -> None:
-        """NonFiniteState where going on has no point."""
+        """NonFiniteState if more of the same would not help."""
         if not self._finite:
             raise NonFiniteState("the learner or the curriculum is not finite", self._before)
         if self._bad_steps == PATIENCE:
-            raise NonFiniteState(f"not one finite gradient in {PATIENCE} train steps", self._before)
+            raise NonFiniteState(f"{self._why} in {PATIENCE} train steps", self._before)
+
+    def require_some_good(self) -> None:
+        """NumbersError if every train step so far was bad: a training that ends has learnt nothing.
+
+        A training that is shorter than `PATIENCE` train steps would else end well."""
+        if self._steps and self._bad_steps == self._steps:
+            raise NumbersError(f"{self._why} in all {self._steps} train steps: nothing is learnt")
+
+
+def _nothing_learnt(metrics: dict[str, float]) -> str:
+    """The reason why a train step learnt nothing; empty if it did learn."""
+    if metrics["broken"] >= ALL:
+        return "every sample was broken"
+    return "not one finite gradient" if metrics["ppo/skipped"] >= ALL else ""
 
 
 def leave(config: Config, path: Path, state: TrainState) -> str:
@@ -101,8 +133,9 @@ def leave(config: Config, path: Path, state: TrainState) -> str:
 
 
 def with_lower_rate(state: TrainState, attempt: int) -> TrainState:
-    """`state` with a lower learning rate, which may not rise at once, and, so that not all comes
-    again, other random draws."""
+    """`state` with a lower learning rate and another random key.
+
+    The rate may not rise at once. The other key avoids the same bad numbers."""
     rate = state.learner.learning_rate * CAUTION**attempt
     # A copy: a train step donates its state, which may not hold one buffer twice.
     learner = state.learner.replace(learning_rate=rate, rate_ceiling=jnp.copy(rate))
@@ -134,5 +167,5 @@ def read_dump(path: Path) -> tuple[Config, TrainState]:
             config = config_lib.from_dict(json.loads(str(arrays["config"])))
             like = jax.eval_shape(lambda: train_step.init(config, 0))
             return config, jax.tree.map_with_path(leaf, like)
-    except Exception as error:  # zip, JSON, config: whatever a wrong file leads to
+    except Exception as error:  # a wrong file can fail as zip, as JSON, or as config
         raise CheckpointError(f"{path} is no dump of a training: {first_line(error)}") from error

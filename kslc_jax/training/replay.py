@@ -23,7 +23,7 @@ Roll = Callable[[TrainState, EnvState, jax.Array], Step]
 
 
 def bad_leaves(tree: Any) -> dict[str, np.ndarray]:
-    """Where (as an array of bools) the numbers of a tree are not finite, by name."""
+    """Leaves with numbers that are not finite: name to an array of bools, True at these numbers."""
     found = {}
     for path, leaf in jax.tree.leaves_with_path(tree):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
@@ -34,7 +34,7 @@ def bad_leaves(tree: Any) -> dict[str, np.ndarray]:
 
 
 def replay(path: Path, steps: int) -> None:
-    """Prints what goes bad in the first of so many train steps in which anything does."""
+    """Runs up to `steps` train steps of a dump; prints the first bad numbers and stops there."""
     config, state = recovery.read_dump(path)
     _, step = train_step.make(config)
     roll = _roller(config)
@@ -53,7 +53,7 @@ def replay(path: Path, steps: int) -> None:
 
 
 def _parts(state: TrainState) -> dict[str, Any]:
-    """What a train step goes from and to."""
+    """The parts of the state that a train step changes."""
     return {"learner": state.learner, "curriculum": state.curriculum, "env": state.env}
 
 
@@ -62,8 +62,7 @@ def _count(name: str, bad: np.ndarray) -> str:
 
 
 def _roller(config: Config) -> Roll:
-    """One control step (state, envs, key): envs as training goes on with, and what was before it
-    masked anything."""
+    """Makes the function of one control step."""
 
     @jax.jit
     def one(state: TrainState, envs: EnvState, key: jax.Array) -> Step:
@@ -75,7 +74,7 @@ def _roller(config: Config) -> Roll:
 
 
 def _first_in_rollout(roll: Roll, config: Config, state: TrainState) -> list[str]:
-    """What goes bad in the first control step in which anything does, and in which environments."""
+    """The bad fields and their environments, in the first control step that has any."""
     envs = jax.vmap(rollout.or_new_episode)(state.env)
     keys = jax.random.split(train_step.step_keys(state)[0], config.ppo.rollout_steps)
     for t, key in enumerate(keys):
@@ -94,7 +93,7 @@ def _first_in_rollout(roll: Roll, config: Config, state: TrainState) -> list[str
 
 
 def _some(bad: np.ndarray, shown: int = 5) -> str:
-    """The first few indices of True."""
+    """The first `shown` indices of True, and the number of the others."""
     indices = bad.nonzero()[0]
     more = f" and {len(indices) - shown} more" if len(indices) > shown else ""
     return ", ".join(map(str, indices[:shown])) + more

@@ -1,9 +1,10 @@
-"""A run folder: its lock, its config and versions, and whether a training may go on in it."""
+"""A run folder: lock, config, versions, and the checks before a training goes on in it."""
 
 import contextlib
 import dataclasses
 import fcntl
 import importlib.metadata
+import itertools
 import json
 import os
 import platform
@@ -15,9 +16,9 @@ from typing import Any
 
 import jax
 
-from kslc_jax import __version__, files
+from kslc_jax import __version__, files, networks, physics
 from kslc_jax import config as config_lib
-from kslc_jax.checkpoint_format import has_checkpoints
+from kslc_jax.checkpoint_format import has_checkpoints, whole_checkpoints
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
 from kslc_jax.runtime import first_line
@@ -27,7 +28,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-che
 
 
 class RunError(UserError):
-    """A run folder that cannot be used; the message says why and what to do."""
+    """This run folder cannot be used; the message says why and what to do."""
 
 
 def versions() -> dict[str, str]:
@@ -73,7 +74,7 @@ def _git(folder: Path, *command: str) -> str:
 
 @contextlib.contextmanager
 def writing(run_dir: Path) -> Generator[None]:
-    """RunError where the run folder cannot be written to."""
+    """Turns an OSError into a RunError: the run folder cannot be written to."""
     try:
         yield
     except OSError as error:
@@ -83,8 +84,9 @@ def writing(run_dir: Path) -> Generator[None]:
 
 @contextlib.contextmanager
 def locked(run_dir: Path) -> Generator[None]:
-    """Holds the run folder's lock, which the system takes back at the process's death; RunError
-    with the other's process id if another process holds it."""
+    """Holds the run folder's lock; RunError with the other process's id if another one holds it.
+
+    The system releases the lock when the process dies."""
     with writing(run_dir):
         file = (run_dir / files.LOCK).open("a+")
     with file:
@@ -101,25 +103,96 @@ def locked(run_dir: Path) -> Generator[None]:
         yield
 
 
-def open_folder(run_dir: Path, config: Config, resume: bool, origin: dict[str, str]) -> None:
-    """Fills a new run folder, or checks that it may go on; RunError or ConfigError if not.
+def open_folder(run_dir: Path, config: Config, resume: bool, facts: dict[str, Any]) -> None:
+    """Fills a new run folder, or checks that the training in it can go on.
 
-    A training that ended before its first train step was saved has left nothing to lose."""
+    Args:
+      run_dir: the folder, which is there.
+      config: what is trained.
+      resume: the training in the folder goes on.
+      facts: `circumstances`, and where the training starts from.
+
+    Raises:
+      RunError: there is no training to go on with, or one that would be lost. A training that
+        ended before its first train step was saved has left nothing to lose.
+      ConfigError: the training in the folder has another config.
+    """
     if resume:
-        difference(read_config(run_dir), config)
+        _require_same(run_dir, config)
     elif has_checkpoints(run_dir) or rows_written(run_dir) > 1:
         raise RunError(
             f"{run_dir} already holds a training: go on with --resume --run-dir "
             f"{shlex.quote(str(run_dir))}, or name another --run-dir"
         )
+    done = last_step(run_dir)
     with writing(run_dir):
         if not resume:
-            files.write_atomically(
-                run_dir / files.VERSIONS, json.dumps(versions() | origin, indent=1)
-            )
-        files.write_atomically(
-            run_dir / files.CONFIG, json.dumps(config_lib.to_dict(config), indent=1)
-        )
+            _write(run_dir / files.VERSIONS, facts)
+        elif done < config.num_updates and (news := _news(run_dir, facts)):
+            kept = _stored_versions(run_dir)
+            news = {"train_step": done, **news}
+            _write(run_dir / files.VERSIONS, kept | {RESUMED: [*kept.get(RESUMED, []), news]})
+        if done <= config.num_updates:
+            _write(run_dir / files.CONFIG, config_lib.to_dict(config))
+
+
+def last_step(run_dir: Path) -> int:
+    """Train step of the latest checkpoint; 0 if there is none."""
+    folder = run_dir / files.CHECKPOINTS
+    return (
+        max((int(p.name) for p in whole_checkpoints(folder)), default=0) if folder.is_dir() else 0
+    )
+
+
+# ---------------------------------------------------------------------------------- circumstances
+
+RESUMED = "resumed"
+"""Entry of versions.json: a list of what was different each time the training went on, and from
+which train step on. The other entries are those of the training's start."""
+
+
+def circumstances(config: Config, devices: int) -> dict[str, Any]:
+    """Everything beside the config that the bits of a training depend on."""
+    engine = physics.resolve_engine(config.physics)
+    return versions() | {"engine": engine, "devices": devices}
+
+
+def what_changed(run_dir: Path, facts: dict[str, Any]) -> str:
+    """Says in a few words what is different since the training last ran; empty if nothing is."""
+    before = _last_known(run_dir)
+    changed = [
+        f"{name} {now} instead of {before[name]}"
+        for name, now in _news(run_dir, facts).items()
+        if name in before
+    ]
+    return f"with {', '.join(changed)} (bits may differ from here)" if changed else ""
+
+
+def _news(run_dir: Path, facts: dict[str, Any]) -> dict[str, Any]:
+    before = _last_known(run_dir)
+    return {name: now for name, now in facts.items() if before.get(name) != now}
+
+
+def _last_known(run_dir: Path) -> dict[str, Any]:
+    """The circumstances under which the training last ran."""
+    known = _stored_versions(run_dir)
+    for changes in known.pop(RESUMED, []):
+        known |= changes
+    return known
+
+
+def _stored_versions(run_dir: Path) -> dict[str, Any]:
+    """versions.json; empty if it is missing or damaged, because no number depends on it."""
+    try:
+        stored = json.loads((run_dir / files.VERSIONS).read_text())
+        resumed = stored.get(RESUMED, [])
+        readable = isinstance(resumed, list) and all(isinstance(x, dict) for x in resumed)
+        return stored if readable else {}
+    except (OSError, ValueError, RecursionError, AttributeError):
+        return {}
+
+
+# ----------------------------------------------------------------------------------------- config
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
@@ -147,10 +220,33 @@ def difference(stored: Config, wanted: Config) -> None:
             for f in dataclasses.fields(a):
                 walk(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}".lstrip("."))
         elif a != b:
-            raise ConfigError(
-                f"{where} is {a} in the run that is there, not {b}: start a new run for that"
-            )
+            raise ConfigError(f"{where} is {a} in the run that is there, not {b}")
 
     for f in dataclasses.fields(stored):
         if f.name != "run":
             walk(getattr(stored, f.name), getattr(wanted, f.name), f.name)
+
+
+def _require_same(run_dir: Path, wanted: Config) -> None:
+    """ConfigError where `difference` raises one; it also says how to begin a new training."""
+    stored = read_config(run_dir)
+    try:
+        difference(stored, wanted)
+    except ConfigError as error:
+        names = (run_dir.with_name(f"{run_dir.name}-{i}") for i in itertools.count(2))
+        command = ["python", "-m", "kslc_jax.train", *config_lib.options(wanted)]
+        command += ["--run-dir", str(next(name for name in names if not name.exists()))]
+        where = "from the start"
+        if _networks(stored) == _networks(wanted):
+            command += ["--start-from", str(run_dir)]
+            where = "with this run's networks and curriculum"
+        raise ConfigError(
+            f"{error}, and --resume goes on with the same training. To begin a new one {where}: "
+            f"{shlex.join(command)}"
+        ) from error
+
+
+def _networks(config: Config) -> Any:
+    """Structure and shapes of a config's networks."""
+    shapes = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
+    return jax.tree.structure(shapes), [x.shape for x in jax.tree.leaves(shapes)]

@@ -26,6 +26,7 @@ from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.evaluation import trials
 from kslc_jax.policy import Policy, load_policy
 from kslc_jax.viewer import panel
+from kslc_jax.viewer.following import Follower
 from kslc_jax.viewer.session import Pacer, Session, View
 
 FPS = 30
@@ -173,13 +174,18 @@ class Viewer:
         host: str = "127.0.0.1",
         port: int = 8080,
         seed: int = 0,
+        follow: bool = False,
     ):
-        """Loads the policy and serves the page; nothing moves before `run`."""
+        """Loads the policy and serves the page; nothing moves before `run`.
+
+        With `follow`, `policy` is the run folder of a training; each new policy of it is taken."""
         self._fidelity: Fidelity = fidelity
         self._seed = seed
+        self._follower = Follower(policy) if follow else None
+        folder = self._follower.wait() if self._follower else policy
         self._policies = policies(policy)
-        self._name = next(iter(self._policies))
-        loaded = load_policy(policy)
+        self._given = self._name = next(iter(self._policies))
+        loaded = load_policy(folder)
         self.server = serve(host, port)
         # Always the high-fidelity model: some shapes of the training model must not be seen.
         self.figure = Figure(self.server, robot_lib.load("high").mj_model)
@@ -216,10 +222,28 @@ class Viewer:
             for client in self.server.get_clients().values():
                 client.add_notification("Not loaded", str(error), color="red")
 
+    def _take(self, folder: Path) -> None:
+        """Goes on with a newer policy of the training, in mid-motion.
+
+        If it cannot be loaded, because the training has removed it, the next one will come."""
+        try:
+            policy = load_policy(folder)
+        except CheckpointError:
+            return
+        if policy.config != self.session.policy.config:
+            self._play(policy)
+            return
+        self.session.policy = policy
+        self.panel.allow(float(policy.curriculum.v_max))
+
     def frame(self, now: float) -> None:
         """Does the control steps that are due at the clock time `now` [s] and draws the result."""
         if self.panel.policy.value != self._name:
             self._switch(self.panel.policy.value)
+        if self._follower and (newer := self._follower.fresh(now)):
+            self._policies[self._given] = newer
+            if self._name == self._given:
+                self._take(newer)
         if self.panel.take_reset():
             self.reset()
         idle = self.panel.paused or not self.server.get_clients()

@@ -1,0 +1,92 @@
+"""The records of a training in Weights & Biases: `train --wandb`, with the package wandb.
+
+The environment variables of wandb count: WANDB_MODE=offline needs no account and no network.
+"""
+
+import contextlib
+import os
+import secrets
+from collections.abc import Callable, Generator
+from pathlib import Path
+from typing import Any
+
+from kslc_jax import config as config_lib
+from kslc_jax import files
+from kslc_jax.config import Config
+from kslc_jax.errors import MissingPackage, UserError
+from kslc_jax.runtime import first_line
+from kslc_jax.training.logs import finite_values
+
+PROJECT = "kslc_jax"
+"""Project of all trainings, if WANDB_PROJECT names no other."""
+
+
+def package() -> Any:
+    """The package wandb; MissingPackage that says what to install."""
+    try:
+        import wandb
+    except ImportError as error:
+        raise MissingPackage(f"--wandb: {error} (pip install 'kslc_jax[wandb]')") from error
+    return wandb
+
+
+class WandbRun:
+    """One training as a run of Weights & Biases. No training ends because of it."""
+
+    def __init__(self, run: Any, warn: Callable[[str], None]):
+        self._run, self._warn = run, warn
+        self._failed = False
+
+    def write(self, record: dict[str, float]) -> None:
+        """Sends the values that TensorBoard shows, too. The first failure is told by `warn`."""
+        try:
+            self._run.log(finite_values(record), step=int(record["step"]))
+        except Exception as error:  # network, disk, or a bug of the package
+            if not self._failed:
+                self._warn(f"cannot write to wandb ({first_line(error)}); training goes on")
+            self._failed = True
+
+    def close(self, exit_code: int) -> None:
+        """Sends what is left; the run is marked as failed if `exit_code` is not 0."""
+        try:
+            self._run.finish(exit_code=exit_code)
+        except Exception as error:
+            self._warn(f"cannot finish the wandb run ({first_line(error)})")
+
+
+@contextlib.contextmanager
+def wandb_run(
+    config: Config, run_dir: Path, resume: bool, warn: Callable[[str], None]
+) -> Generator[WandbRun]:
+    """Opens the run of a training, the same one after a resume; UserError if wandb refuses."""
+    wandb = package()
+    try:
+        run = wandb.init(
+            project=os.environ.get("WANDB_PROJECT", PROJECT),
+            name=os.environ.get("WANDB_NAME", run_dir.name),
+            id=_run_id(run_dir, resume),
+            resume="allow",
+            dir=str(run_dir),
+            config=config_lib.to_dict(config),
+            settings=wandb.Settings(console="off"),  # the progress table is no log
+        )
+        run.define_metric("*", step_metric="env_steps")
+    except Exception as error:  # no account, no network, a wrong setting
+        raise UserError(f"--wandb: {first_line(error)} (WANDB_MODE=offline needs none)") from error
+    opened = WandbRun(run, warn)
+    try:
+        yield opened
+    except BaseException:
+        opened.close(1)
+        raise
+    opened.close(0)
+
+
+def _run_id(run_dir: Path, resume: bool) -> str:
+    """The id that the run folder keeps, or a new one."""
+    path = run_dir / files.WANDB_ID
+    if resume and path.exists():
+        return path.read_text().strip()
+    new = secrets.token_hex(4)
+    files.write_atomically(path, new)
+    return new

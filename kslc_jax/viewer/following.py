@@ -1,0 +1,55 @@
+"""The newest policy of a training that is running."""
+
+import math
+import time
+from pathlib import Path
+
+from kslc_jax import files
+from kslc_jax.checkpoint_format import has_checkpoints, whole_checkpoints
+from kslc_jax.config import ConfigError
+
+LOOK_SECONDS = 1.0
+"""Time [s] between two looks into the run folder."""
+
+
+def newest(run_dir: Path) -> Path | None:
+    """The folder of the latest checkpoint or snapshot; None before the first checkpoint."""
+    if not has_checkpoints(run_dir):
+        return None
+    folders = [run_dir / files.CHECKPOINTS, run_dir / files.SNAPSHOTS]
+    found = [path for folder in folders if folder.is_dir() for path in whole_checkpoints(folder)]
+    # Of two of the same train step the snapshot: the training never removes it.
+    return max(found, key=lambda p: (int(p.name), p.parent.name == files.SNAPSHOTS), default=None)
+
+
+class Follower:
+    """Names each new policy of one run folder once."""
+
+    def __init__(self, run_dir: Path):
+        """ConfigError if the folder is not that of a training."""
+        if not (run_dir / files.CONFIG).is_file():
+            raise ConfigError(
+                f"--follow: {run_dir} is no run folder of a training (no {files.CONFIG})"
+            )
+        self._run_dir = run_dir
+        self._seen: Path | None = None
+        self._looked = -math.inf
+
+    def wait(self) -> Path:
+        """The folder of the newest policy; waits for the first one."""
+        if newest(self._run_dir) is None:
+            print(f"waiting for the first checkpoint in {self._run_dir}", flush=True)
+        while (path := self.fresh(time.monotonic())) is None:
+            time.sleep(LOOK_SECONDS)
+        return path
+
+    def fresh(self, now: float) -> Path | None:
+        """The folder of the newest policy if there is a new one at the clock time `now` [s]."""
+        if now - self._looked < LOOK_SECONDS:
+            return None
+        self._looked = now
+        path = newest(self._run_dir)
+        if path == self._seen:
+            return None
+        self._seen = path
+        return path

@@ -1,0 +1,67 @@
+"""Signals that stop a training, in the main thread and in others."""
+
+import signal
+import threading
+
+import pytest
+
+from kslc_jax.training import stopping
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    """The tests leave all handlers as they were."""
+    before = {number: signal.getsignal(number) for number in stopping.SIGNALS}
+    yield
+    assert {number: signal.getsignal(number) for number in stopping.SIGNALS} == before
+
+
+def test_first_signal_asks_second_interrupts():
+    with stopping.stop_requests() as stop:
+        signal.raise_signal(signal.SIGINT)
+        assert stop.requested == "SIGINT"
+        signal.raise_signal(signal.SIGTERM)  # the same wish, come by another way
+        assert stop.requested == "SIGINT"
+        stop._since -= stopping.SAME_SIGNAL_SECONDS
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGUSR1", "SIGUSR2", "SIGXCPU"])
+def test_warnings_ask_and_never_interrupt(name):
+    """After Slurm's SIGUSR1 comes its SIGTERM: the training still has the time to save."""
+    with stopping.stop_requests() as stop:
+        assert stop.requested is None
+        for _ in range(3):
+            signal.raise_signal(getattr(signal, name))
+        assert stop.requested == name
+        signal.raise_signal(signal.SIGTERM)
+        stop._since -= stopping.SAME_SIGNAL_SECONDS
+        signal.raise_signal(getattr(signal, name))
+        assert stop.requested == name
+
+
+def test_nohup_keeps_its_promise():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stopping.stop_requests() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert stop.requested is None
+            signal.raise_signal(signal.SIGTERM)
+            assert stop.requested == "SIGTERM"
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_in_another_thread_signals_stay_as_they_are():
+    during = []
+
+    def work():
+        with stopping.stop_requests():
+            during.extend(map(signal.getsignal, stopping.SIGNALS))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert during == [signal.getsignal(number) for number in stopping.SIGNALS]

@@ -1,0 +1,89 @@
+"""Commands whose output is closed or cannot be written."""
+
+import importlib
+import io
+import os
+import subprocess
+import sys
+
+import pytest
+
+from kslc_jax import cli, streams
+
+COMMANDS = ["train", "evaluate", "sim2sim", "play", "export", "plots", "compare", "learning"]
+COMMANDS += ["reproduce", "doctor"]
+
+
+@pytest.fixture
+def closed(monkeypatch):
+    """Standard output and error whose reader has gone, as in a process of its own."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    for name in ("stdout", "stderr"):
+        stream = io.TextIOWrapper(io.FileIO(writer, "w", closefd=False), write_through=True)
+        with pytest.raises(BrokenPipeError):
+            stream.write("x")
+        monkeypatch.setattr(sys, name, stream)
+        monkeypatch.setattr(sys, f"__{name}__", stream)
+    yield
+    os.close(writer)
+
+
+def test_a_command_goes_on_without_its_reader(closed):
+    done = []
+
+    def work():
+        for i in range(1000):
+            print("x" * 100, flush=i % 2 == 0)
+            print("y" * 100, file=sys.stderr)
+        done.append(True)
+        return 3
+
+    before = sys.stdout
+    assert cli.run(work) == 3 and done
+    assert sys.stdout is before
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_without_a_reader(name, closed):
+    with pytest.raises(SystemExit) as end:
+        importlib.import_module(f"kslc_jax.{name}").main(["--help"])
+    assert end.value.code == 0
+
+
+def test_help_into_head():
+    line = f"{sys.executable} -m kslc_jax.train --help | head -n 1; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", line], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "0" and done.stderr == ""
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has it")
+@pytest.mark.parametrize(("needs_output", "code"), [(True, 2), (False, 0)])
+def test_output_onto_a_full_disk(needs_output, code, monkeypatch, capsys):
+    """A table that cannot be written is a failure, lines about a training are none."""
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        monkeypatch.setattr(sys, "__stdout__", full)
+        assert cli.run(lambda: print("table"), needs_output=needs_output) == code
+    said = capsys.readouterr().err
+    assert said == "error: cannot write the output: No space left on device\n" * needs_output
+
+
+def test_streams_of_a_notebook_stay():
+    mine = io.StringIO()
+    before, sys.stdout = sys.stdout, mine
+    try:
+        with streams.lasting() as output:
+            assert sys.stdout is mine
+            print("x")
+    finally:
+        sys.stdout = before
+    assert mine.getvalue() == "x\n" and output.failure is None
+
+
+def test_missing_streams_are_opened():
+    """Else the first file that is opened would be what libraries write errors to."""
+    code = "import os; from kslc_jax import streams; streams.open_missing()\n"
+    code += "file = open(os.devnull); os.write(2, b'x'); raise SystemExit(file.fileno())"
+    done = subprocess.run(["bash", "-c", f'{sys.executable} -c "{code}" 0<&- 1>&- 2>&-'])
+    assert done.returncode > 2
