@@ -607,7 +607,7 @@ class TestLock:
 
     def test_death_releases(self, tmp_path):
         code = (
-            "import time; from pathlib import Path; from kslc_jax import run_folder\n"
+            "import time; from pathlib import Path; from kslc_jax.training import run_folder\n"
             f"with run_folder.locked(Path({str(tmp_path)!r})):\n"
             "    print('locked', flush=True); time.sleep(99)"
         )

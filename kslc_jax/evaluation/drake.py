@@ -243,7 +243,7 @@ def advance(
 
     A step that Drake gives up on leaves NaN, as a diverged one does in MuJoCo.
     """
-    robot, motors = world.robot, world.plant.get_actuation_input_port()
+    robot, actuation = world.robot, world.plant.get_actuation_input_port()
     joint_friction = world.data.model.dof_frictionloss[6:]
     torque, forces = np.asarray(state.torque), np.zeros(len(world.feet))
     try:
@@ -253,7 +253,7 @@ def advance(
             q, dq = qpos[7:], qvel[6:]
             torque = motors.motor_torque(robot, dynamics, q, dq, target, np)
             passive = -joint_friction * np.tanh(dq / motors.FRICTION_SPEED)
-            motors.FixValue(world.plant_context, torque + passive + robot.kd * dq)
+            actuation.FixValue(world.plant_context, torque + passive + robot.kd * dq)
             if i == steps - 1:
                 forces = foot_forces(world)
             new = world.diagram.EvalUniquePeriodicDiscreteUpdate(world.context)
