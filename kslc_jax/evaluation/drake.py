@@ -34,7 +34,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
-from kslc_jax import physics
+from kslc_jax import motors, physics
 from kslc_jax.config import PhysicsConfig
 from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics, model_fields
