@@ -35,7 +35,7 @@ OLDER_POLICIES = (1,)
 """Schemas of which only the policy is still read. 1: no ceiling of the learning rate."""
 
 
-class CheckpointError(UserError):
+class CheckpointError(UserError, RuntimeError):
     """A checkpoint that is missing, damaged or of another config; the message says which."""
 
 

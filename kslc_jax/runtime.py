@@ -98,7 +98,7 @@ def idle_gpu() -> str:
     return f"{IDLE_GPU}: {CUDA_FIX}"
 
 
-class JaxError(UserError):
+class JaxError(UserError, RuntimeError):
     """An installed JAX that must not be trained with."""
 
 

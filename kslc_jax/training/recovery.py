@@ -34,7 +34,7 @@ CAUTION = 0.5
 """Factor on the learning rate at each of them."""
 
 
-class NumbersError(UserError):
+class NumbersError(UserError, RuntimeError):
     """Numbers that go bad however often the training goes back."""
 
     exit_code = 1

@@ -26,7 +26,7 @@ from kslc_jax.training.logs import rows_written
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-class RunError(UserError):
+class RunError(UserError, RuntimeError):
     """A run folder that cannot be used; the message says why and what to do."""
 
 
