@@ -41,7 +41,7 @@ ROBOT_NUMBERS = "robot_numbers"
 """Entry of a meta item: the `fingerprint` of the robot. Older checkpoints have none."""
 
 
-class CheckpointError(UserError):
+class CheckpointError(UserError, RuntimeError):
     """A checkpoint that is missing, damaged or of another config; the message says which."""
 
 

@@ -205,7 +205,7 @@ def idle_gpu() -> str:
     return f"{IDLE_GPU}: {CUDA_FIX}"
 
 
-class JaxError(UserError):
+class JaxError(UserError, RuntimeError):
     """The installed JAX cannot train reliably."""
 
 

@@ -19,11 +19,11 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
+import kslc_jax.evaluation
 from kslc_jax import (
     compare,
     doctor,
     evaluate,
-    evaluation,
     export,
     files,
     learning,
@@ -342,7 +342,7 @@ class TestPlay:
     def test_drake_is_not_installed(self, monkeypatch, tmp_path):
         """The command says so before it looks for the policy."""
         monkeypatch.setitem(sys.modules, "kslc_jax.evaluation.drake", None)
-        monkeypatch.delattr(evaluation, "drake", raising=False)
+        monkeypatch.delattr(kslc_jax.evaluation, "drake", raising=False)
         assert "kslc_jax[drake]" in refused(play.main, tmp_path, *PICTURE, "--engine", "drake")
 
     def test_drake_has_no_training_engine(self, policy):

@@ -154,7 +154,7 @@ def make(
 # ------------------------------------------------------------------------------- several processes
 
 
-class Elsewhere(UserError):
+class Elsewhere(UserError, RuntimeError):
     """Another process gave up, and says why."""
 
 

@@ -38,7 +38,7 @@ CAUTION = 0.5
 """Factor on the learning rate each time it goes back."""
 
 
-class NumbersError(UserError):
+class NumbersError(UserError, RuntimeError):
     """The numbers go bad however often the training goes back."""
 
     exit_code = 1

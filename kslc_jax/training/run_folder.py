@@ -27,7 +27,7 @@ from kslc_jax.training.logs import rows_written
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-class RunError(UserError):
+class RunError(UserError, RuntimeError):
     """This run folder cannot be used; the message says why and what to do."""
 
 
