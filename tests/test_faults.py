@@ -473,7 +473,7 @@ class TestResume:
     @pytest.mark.parametrize(
         ("change", "says"),
         [
-            (["--ppo.learning-rate", "3e-4"], "ppo.learning_rate is 1e-05 in the run that is"),
+            (["--ppo.learning-rate", "3e-4"], "ppo.learning_rate is 0.001 in the run that is"),
             (["--env.num-envs", "32"], "env.num_envs is 16 in the run that is there, not 32"),
             (["--seed", "5"], "seed is 0 in the run that is there, not 5"),
             (["--env.frames", "4"], "env.frames is 3 in the run that is there, not 4"),
