@@ -90,8 +90,8 @@ def fix_numerics() -> list[str]:
         text = os.environ.pop(name.upper(), "")
         if text and not _means(text, ours):
             found[name.upper()] = text
-        if "jax" in sys.modules:
-            options = sys.modules["jax"].config
+        if jax := sys.modules.get("jax"):
+            options = jax.config
             value = getattr(options, name, ours)  # a JAX may have dropped an option
             if value != ours:
                 found.setdefault(name.upper(), str(value))

@@ -1036,7 +1036,7 @@ class TestDeterminism:
             monkeypatch.setattr(
                 physics,
                 "_batch",
-                lambda robot, size, _, n=threads: real(robot, size, n),
+                lambda robot, size, _, written, n=threads: real(robot, size, n, written),
             )
             rows.append(twenty_steps(init, step))
             assert any(key[2] == threads for key in physics._batches)
