@@ -41,7 +41,7 @@ from rich.table import Table
 from kslc_jax import cli, evaluate, files
 from kslc_jax.config import ConfigError, HighFidelity, require_seed
 from kslc_jax.errors import MissingPackage
-from kslc_jax.evaluation import schedules, tables
+from kslc_jax.evaluation import tables
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ def _rows(
     args: Args, policy: "Policy", condition: str, progress: Callable[[float], None]
 ) -> list[dict[str, Any]]:
     """The rows of one condition, with the reasons why they lie beyond the training."""
-    from kslc_jax.evaluation import scheduled, trained
+    from kslc_jax.evaluation import scheduled, schedules, trained
     from kslc_jax.evaluation.measure import measure
 
     conditions = setting(args, condition)
@@ -233,6 +233,7 @@ def main(argv: list[str] | None = None) -> int:
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, keeps the numbers."""
     simulator(args.engine)  # what is not installed is told before anything is loaded
+    from kslc_jax.evaluation import schedules
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)

@@ -1,5 +1,6 @@
 """Exported files against JAX, and the stand-alone runner of exported files against the package."""
 
+import copy
 import dataclasses
 import functools
 import importlib.util
@@ -23,6 +24,7 @@ from kslc_jax import (
     motors,
     networks,
     observations,
+    physics,
     randomize,
     robot,
 )
@@ -121,9 +123,9 @@ def test_the_symmetric_actor_as_a_plain_mlp_mirrors(symmetric, tmp_path):
     np.testing.assert_allclose(network(mirrored), network(seen)[:, joints] * joint_sign, atol=2e-6)
 
 
-def test_the_graph_estimates_the_velocity_and_then_acts(onnx_file):
+def test_the_graph_estimates_the_velocity_and_then_acts(policy, onnx_file):
     model = onnx.load(onnx_file)
-    estimator = ["Gemm", "Elu", "Gemm", "Concat"]
+    estimator = ["Gemm", "Elu", "Gemm", "Concat"] if policy.config.network.estimator else []
     actor = ["Gemm", "Elu"] * 2 + ["Gemm"]
     assert [n.op_type for n in model.graph.node] == ["Flatten", *estimator, *actor]
     (history,), (action,) = model.graph.input, model.graph.output
@@ -314,10 +316,10 @@ def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajecto
 
 
 def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
-    """The runner simulates 0.8 s alone: actions, torques, servos, physics steps."""
+    """The runner simulates 0.8 s alone: actions, torques, servos, physics steps. Its model is the
+    package's, where parts meet: the legs of a random policy do."""
     steps = 80
-    model = mujoco.MjModel.from_xml_path(str(robot.MODEL_PATH))
-    model.opt.timestep = STEPPED.timestep
+    model = copy.copy(physics.robot_for(STEPPED).mj_model)
     for i in range(ROBOTS):
         controller = controller_of(runner, onnx_file, trajectory, i)
         track = runner.simulate(controller, model, 0.01 * steps)

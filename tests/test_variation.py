@@ -12,7 +12,7 @@ import pytest
 from kslc_jax import curriculum, networks, physics, randomize, robot
 from kslc_jax.config import ConfigError, HighFidelity, preset
 from kslc_jax.evaluation import disturbances, trials, variation
-from kslc_jax.evaluation.variation import Variation
+from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.policy import Policy
 
 DT = 0.01

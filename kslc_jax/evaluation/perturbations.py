@@ -1,12 +1,37 @@
-"""Perturbations by name: friction=0.3, payload=5, links=0.1, ... and what they change."""
+"""Perturbations by name: friction=0.3, payload=5, links=0.1, ... and what they change. Imports no
+JAX: a command line is checked before anything heavy starts."""
 
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from kslc_jax.config import ConfigError, RandomizeConfig
-from kslc_jax.evaluation.variation import Variation
+
+MOST_INSET = 0.04
+"""Largest `sole` [m]: soles keep some area."""
+
+
+@dataclass(frozen=True)
+class Variation:
+    """By how much robots differ; 0 is the described robot."""
+
+    hands: float = 0.0
+    """Mass added at each hand [kg]."""
+    sole: float = 0.0
+    """Each side of a sole lies up to this far inside the foot's outline [m], anew every control
+    step."""
+    joints: float = 0.0
+    """Largest Coulomb friction [N m] and largest damping [N m s/rad] added to each joint."""
+
+    def __post_init__(self):
+        for name in ("hands", "joints"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must not be negative")
+        if not 0 <= self.sole <= MOST_INSET:
+            raise ConfigError(f"sole must lie in [0, {MOST_INSET}] m")
+
 
 PUSH_SECONDS = 4.0
 """Time between pushes."""

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from kslc_jax.config import Config, RandomizeConfig
-from kslc_jax.evaluation import variation
+from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Schedule
 from kslc_jax.evaluation.trials import Setting
 from kslc_jax.policy import Policy
@@ -30,13 +30,14 @@ def beyond(
     schedule = setting.schedule
     asked = _commanded(schedule, trained) if schedule else [tuple(command)]
     reasons = _command_reasons(trained, v_max, asked)
-    if schedule and _pace(schedule) < trained.command.resample_seconds - TOLERANCE:
+    shortest = trained.command.shortest_seconds or trained.command.resample_seconds
+    if schedule and _pace(schedule) < shortest - TOLERANCE:
         reasons.append("pace")
     reasons += _robot_reasons(trained.randomize, setting.randomize)
     if setting.latency > trained.env.action_delay:
         reasons.append("latency")
     others = {"imu": any(setting.imu_offset), "punch": setting.punch, "arms": setting.hold_arms}
-    for field in dataclasses.fields(variation.Variation):
+    for field in dataclasses.fields(Variation):
         others[field.name] = getattr(setting.variation, field.name)
     reasons += [name for name, value in others.items() if value]
     return {"beyond": reasons} if reasons else {}

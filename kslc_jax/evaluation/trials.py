@@ -16,10 +16,14 @@ from kslc_jax import commands, env, maths, networks, observations, physics, rand
 from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.evaluation import disturbances, schedules, variation
+from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Leg, Schedule
-from kslc_jax.evaluation.variation import Body, Variation
+from kslc_jax.evaluation.variation import Body
 from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
+
+AS_DESCRIBED = Variation()
+"""The described robot."""
 
 NOMINAL = RandomizeConfig(
     friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0
@@ -58,7 +62,7 @@ class Setting:
     """Force [N] at a random link every `disturbances.PUNCH_EVERY` seconds."""
     hold_arms: bool = False
     """The arms' targets walk at random, whatever the policy asks for."""
-    variation: Variation = variation.NOMINAL
+    variation: Variation = AS_DESCRIBED
     """How robots differ beside `randomize`."""
 
 
@@ -251,7 +255,7 @@ def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key
         more["force"] = disturbances.punch(
             robot, setting.punch, trial.key, trial.steps, config.control_dt
         )
-    if setting.variation != variation.NOMINAL:
+    if setting.variation != AS_DESCRIBED:
         key_body = jax.random.fold_in(key, 1)
         more["alter"] = functools.partial(
             variation.alter, setting.variation, robot, trial.body, key_body

@@ -5,7 +5,6 @@ They change fields of the mjModel, see `physics.step`. One robot each.
 """
 
 import functools
-from dataclasses import dataclass
 
 import flax.struct
 import jax
@@ -13,7 +12,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from kslc_jax.config import NUM_JOINTS, ConfigError
+from kslc_jax.config import NUM_JOINTS
+from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
 
 FEET = ("left_foot", "right_foot")
@@ -22,34 +22,7 @@ FEET = ("left_foot", "right_foot")
 TILT = 0.003
 """Largest tilt of a wandering sole about each horizontal axis [rad]: 2 to 4 of its corners bear."""
 
-MOST_INSET = 0.04
-"""Largest `sole` [m]: soles keep some area."""
-
 Fields = dict[str, jax.Array]
-
-
-@dataclass(frozen=True)
-class Variation:
-    """By how much robots differ; 0 is the described robot."""
-
-    hands: float = 0.0
-    """Mass added at each hand [kg]."""
-    sole: float = 0.0
-    """Each side of a sole lies up to this far inside the foot's outline [m], anew every control
-    step."""
-    joints: float = 0.0
-    """Largest Coulomb friction [N m] and largest damping [N m s/rad] added to each joint."""
-
-    def __post_init__(self):
-        for name in ("hands", "joints"):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"{name} must not be negative")
-        if not 0 <= self.sole <= MOST_INSET:
-            raise ConfigError(f"sole must lie in [0, {MOST_INSET}] m")
-
-
-NOMINAL = Variation()
-"""The described robot."""
 
 
 @flax.struct.dataclass
