@@ -224,7 +224,7 @@ def _host_step(
     target: np.ndarray,
     dynamics: Dynamics,
     fields: dict[str, np.ndarray],
-    force: np.ndarray | None,
+    force: np.ndarray | None = None,
 ) -> PhysicsState:
     """One control step of a batch in C MuJoCo; numpy in, numpy out. The result has the dtypes of
     `state`.

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from kslc_jax import curriculum, env, observations, physics, signals
+from kslc_jax import commands, curriculum, env, observations, physics, signals
 from kslc_jax.config import preset
 
 
@@ -126,11 +126,11 @@ def test_pushes(debug, adds):
     assert float(on.physics.qvel[2]) == 3.0
 
 
-def test_commands_are_resampled_every_8_seconds(setting):
+def test_a_command_holds_until_its_time_is_over(setting):
     """The reward of the step uses the command that the policy saw, not the new one."""
     config, reset, step = setting
     robot = physics.robot_for(config.physics)
-    state = reset(jax.random.key(3))
+    state = reset(jax.random.key(3)).replace(command_until=jnp.asarray(800))
     command = state.command.velocity[:2]
     for time, changes in ((798, False), (799, True)):
         new, outcome = step(state.replace(time=jnp.asarray(time)), jnp.zeros(16), jax.random.key(4))
@@ -140,12 +140,24 @@ def test_commands_are_resampled_every_8_seconds(setting):
         assert float(outcome.terms["tracking_lin_vel"]) == pytest.approx(float(expected), rel=1e-5)
 
 
+@pytest.mark.parametrize(("preset_name", "shortest"), [("paper", 8.0), ("laptop", 1.0)])
+def test_commands_hold_for_8_seconds_or_for_1_to_8(preset_name, shortest):
+    config = preset(preset_name)
+    keys = jax.random.split(jax.random.key(0), 2000)
+    steps = jax.vmap(lambda k: commands.holding_steps(config.command, k, config.control_dt))(keys)
+    assert abs(int(steps.min()) - 100 * shortest) <= 2 and abs(int(steps.max()) - 800) <= 2
+
+
 def test_tracking_settles_two_seconds_after_a_new_command(setting):
-    """With the laptop's settle time: 200 steps after the reset and after the new command at 800."""
+    """With the laptop's settle time: 200 steps after the reset and after a new command at 800."""
     _, reset, step = setting
-    state = reset(jax.random.key(3))
-    for time, settled in ((0, False), (199, False), (200, True), (799, True), (800, False)):
-        _, outcome = step(state.replace(time=jnp.asarray(time)), jnp.zeros(16), jax.random.key(4))
+    state = reset(jax.random.key(3)).replace(command_until=jnp.asarray(2000))
+    for time, since, settled in (
+        *((0, 0, False), (199, 0, False), (200, 0, True)),
+        *((800, 800, False), (999, 800, False), (1000, 800, True)),
+    ):
+        now = state.replace(time=jnp.asarray(time), command_since=jnp.asarray(since))
+        _, outcome = step(now, jnp.zeros(16), jax.random.key(4))
         assert bool(outcome.settled) == settled, time
 
 
