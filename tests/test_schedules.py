@@ -244,7 +244,8 @@ def test_what_lies_beyond_the_training_is_named(still):
     assert reasons(latency=1, punch=300.0) == ["latency", "punch"]
     assert reasons(hold_arms=True, imu_offset=(0.1, 0.0)) == ["imu", "arms"]
     stop = schedules.named("stop", CONFIG, v_max)
-    assert reasons(schedule=stop) == ["pace"]
+    jitter = schedules.named("jitter", CONFIG, v_max)
+    assert reasons(schedule=stop) == [] and reasons(schedule=jitter) == ["pace"]
     assert reasons(schedule=dataclasses.replace(stop, steps=(schedules.Step(9.0, 9.0),))) == [
         "speed"
     ]

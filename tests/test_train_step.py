@@ -167,7 +167,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
         physics=old.physics.replace(qvel=old.physics.qvel.at[-1, 8].set(jnp.nan)),
     )
     new, got = jax.jit(lambda s: train_step.step(config, s))(state.replace(env=old))
-    dist, value = got["seen"]
+    dist, value, _ = got["seen"]
     np.testing.assert_allclose(dist.mean, got["samples"].mean, atol=1e-5)
     np.testing.assert_allclose(value, got["samples"].value, atol=1e-5)
     log_prob = dist.log_prob(got["samples"].action)
