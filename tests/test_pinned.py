@@ -1,4 +1,5 @@
-"""The metrics of 20 train steps of the debug preset, compared with a stored file.
+"""The metrics of 20 train steps of the debug preset, and what the shipped policy does and is
+exported as, compared with a stored file.
 
 A refactoring must not change a number. A commit that changes numbers on purpose also writes the
 file again:
@@ -7,6 +8,7 @@ file again:
 """
 
 import dataclasses
+import hashlib
 import importlib.metadata
 import json
 import platform
@@ -17,11 +19,14 @@ import numpy as np
 import pytest
 
 from kslc_jax import config as config_lib
-from kslc_jax import train_step
+from kslc_jax import export, load_policy, train_step
+from kslc_jax.evaluation import trials
 
 FILE = Path(__file__).parent / "data" / "pinned_metrics.json"
 
 STEPS = 20
+
+POLICY = "xbot_l_run"
 
 FIRST_STEPS = 2
 """Train steps to compare on another machine. Later, chaos amplifies its other rounding."""
@@ -57,6 +62,20 @@ def metrics(engine: str, steps: int = STEPS) -> dict[str, list[str]]:
     return {name: [row[name] for row in rows] for name in rows[0]}
 
 
+def behaviour(fidelity: config_lib.Fidelity) -> list[str]:
+    """Every number of the state of one robot after a second at 2 m/s, as hexadecimal floats."""
+    policy = load_policy(POLICY)
+    setting = trials.Setting(trials.engine(policy, fidelity), seconds=1.0)
+    (trace,) = trials.run(policy, setting, np.array([[2.0, 0.0, 0.0]]))
+    last = [trace.qpos[-1, 0], trace.joint_vel[-1, 0], trace.torque[-1, 0]]
+    return [float(x).hex() for x in np.concatenate(last)]
+
+
+def exported() -> str:
+    """SHA-256 of the ONNX file."""
+    return hashlib.sha256(export.to_onnx(load_policy(POLICY))).hexdigest()
+
+
 def check(engine: str) -> None:
     """Fails if a metric differs from the stored one."""
     stored = json.loads(FILE.read_text())
@@ -76,6 +95,20 @@ def test_numbers_in_c_mujoco_are_pinned():
     check("mujoco")
 
 
+def test_what_the_shipped_policy_does_is_pinned():
+    stored = json.loads(FILE.read_text())
+    exact = stored["machine"] == machine()
+    for fidelity in ("train", "high"):
+        found, wanted = behaviour(fidelity), stored["policy"][fidelity]
+        if exact:
+            assert found == wanted, fidelity
+        else:  # a second is long enough for another rounding to grow
+            numbers = [[float.fromhex(x) for x in row] for row in (found, wanted)]
+            np.testing.assert_allclose(numbers[0][:7], numbers[1][:7], atol=0.05)
+    if exact:
+        assert exported() == stored["policy"]["onnx"]
+
+
 @pytest.mark.slow  # MJX takes a minute to compile where nothing is cached
 def test_numbers_in_mjx_are_pinned():
     check("mjx")
@@ -83,7 +116,12 @@ def test_numbers_in_mjx_are_pinned():
 
 def main() -> None:
     """Writes the file again."""
-    pinned = {"machine": machine(), **{engine: metrics(engine) for engine in ("mujoco", "mjx")}}
+    fidelities: tuple[config_lib.Fidelity, ...] = ("train", "high")
+    pinned = {
+        "machine": machine(),
+        **{engine: metrics(engine) for engine in ("mujoco", "mjx")},
+        "policy": {f: behaviour(f) for f in fidelities} | {"onnx": exported()},
+    }
     FILE.write_text(json.dumps(pinned, indent=1) + "\n")
 
 
