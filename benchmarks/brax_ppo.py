@@ -24,15 +24,15 @@ from brax.training.agents.ppo import train as brax_train
 from brax.training.networks import FeedForwardNetwork
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import env, networks, observations
-from kslc_jax.config import NUM_JOINTS, Config
+from kslc_jax import env, networks, observations, physics
+from kslc_jax.config import Config
 
 
 class Adapter(brax.envs.Env):
     """Our environment with Brax's interface. It resets itself, so Brax's wrapper must not."""
 
     def __init__(self, config: Config):
-        self.config = config
+        self.config, self.robot = config, physics.robot_for(config.physics)
         self.curriculum = curriculum_lib.init(config)
 
     def reset(self, rng: jax.Array) -> brax.envs.State:
@@ -54,12 +54,12 @@ class Adapter(brax.envs.Env):
     @property
     def observation_size(self) -> Any:
         frames = self.config.env.frames, self.config.env.privileged_frames
-        widths = observations.ACTOR_WIDTH, observations.CRITIC_WIDTH
+        widths = observations.actor_width(self.robot), observations.critic_width(self.robot)
         return {"state": frames[0] * widths[0], "privileged_state": frames[1] * widths[1]}
 
     @property
     def action_size(self) -> int:
-        return NUM_JOINTS
+        return self.robot.count
 
     @property
     def backend(self) -> str:
@@ -78,16 +78,18 @@ def _wrap(adapter: Adapter, **_: Any) -> brax.envs.Env:
 
 def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]:
     """Our actor and critic with Brax's interface."""
+    robot = physics.robot_for(config.physics)
+    widths = observations.actor_width(robot), observations.critic_width(robot)
 
     def stacked(obs: jax.Array, width: int) -> jax.Array:
         return obs.reshape(*obs.shape[:-1], -1, width)
 
     def policy(_, params, obs):
-        dist = networks.policy(config, params, stacked(obs["state"], observations.ACTOR_WIDTH))
+        dist = networks.policy(config, params, stacked(obs["state"], widths[0]))
         return dist.mean, jnp.broadcast_to(jnp.exp(dist.log_std), dist.mean.shape)
 
     def value(_, params, obs):
-        history = stacked(obs["privileged_state"], observations.CRITIC_WIDTH)
+        history = stacked(obs["privileged_state"], widths[1])
         return networks.value(config, params, history)
 
     def part(*names: str) -> Callable[[jax.Array], networks.Params]:
@@ -97,7 +99,7 @@ def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]
         return brax_networks.PPONetworks(
             FeedForwardNetwork(part("actor", "log_std"), policy),
             FeedForwardNetwork(part("critic"), value),
-            distribution.NormalDistribution(NUM_JOINTS),
+            distribution.NormalDistribution(robot.count),
         )
 
     return factory

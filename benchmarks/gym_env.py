@@ -14,8 +14,8 @@ import mujoco
 import numpy as np
 
 from kslc_jax import motors, observations, robot
-from kslc_jax.config import NUM_JOINTS, Config
-from kslc_jax.gait import LEG, SOLE_DROP, pattern
+from kslc_jax.config import Config
+from kslc_jax.gait import LEG, pattern
 from kslc_jax.signals import CONTACT_FORCE
 
 Observation = dict[str, np.ndarray]
@@ -38,24 +38,26 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
             config.physics.timestep,
             config.physics.iterations,
             config.physics.ls_iterations,
+            config.physics.robot,
         )
+        frames = observations.actor_table(self.robot), observations.critic_table(self.robot)
         self.model = copy.copy(self.robot.mj_model)  # its servos change at every step
         self.data = mujoco.MjData(self.model)
         self.rng = np.random.default_rng(seed)
         shapes = {
-            "policy": (config.env.frames, observations.ACTOR_WIDTH),
-            "critic": (config.env.privileged_frames, observations.CRITIC_WIDTH),
+            "policy": (config.env.frames, observations.width(frames[0])),
+            "critic": (config.env.privileged_frames, observations.width(frames[1])),
         }
         self.observation_space = gymnasium.spaces.Dict(
             {name: gymnasium.spaces.Box(-np.inf, np.inf, shape) for name, shape in shapes.items()}
         )
-        self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (NUM_JOINTS,))
+        self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (self.robot.count,))
         self._history = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
         self._scale = {
-            "policy": observations.row(observations.ACTOR, "scale"),
-            "critic": observations.row(observations.CRITIC, "scale"),
+            "policy": observations.row(frames[0], "scale"),
+            "critic": observations.row(frames[1], "scale"),
         }
-        noise = observations.row(observations.ACTOR, "noise") * self._scale["policy"]
+        noise = observations.row(frames[0], "noise") * self._scale["policy"]
         self._noise = config.env.noise_level * noise
         self._legs = [pattern(self.robot, side, LEG) for side in ("left", "right")]
         self._slices = {
@@ -71,9 +73,9 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         mujoco.mj_resetData(self.model, self.data)
         noise = self.config.env.reset_joint_noise
         self.data.qpos[:] = self.robot.default_qpos
-        self.data.qpos[7:] += self.rng.uniform(-noise, noise, NUM_JOINTS)
-        self.action = np.zeros(NUM_JOINTS)
-        self.last_action = np.zeros(NUM_JOINTS)
+        self.data.qpos[7:] += self.rng.uniform(-noise, noise, self.robot.count)
+        self.action = np.zeros(self.robot.count)
+        self.last_action = np.zeros(self.robot.count)
         self.command = np.array([self.rng.uniform(0.0, 1.0), self.rng.uniform(-0.3, 0.3), 0.0])
         self.time = 0
         for history in self._history.values():
@@ -86,7 +88,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         action = np.clip(action, -config.env.action_clip, config.env.action_clip)
         delay = config.env.action_delay * self.rng.random()
         action = (1.0 - delay) * action + delay * self.action
-        action *= 1.0 + config.env.action_noise * self.rng.standard_normal(NUM_JOINTS)
+        action *= 1.0 + config.env.action_noise * self.rng.standard_normal(self.robot.count)
         self.last_action, self.action = self.action, action
         joint_vel = self.data.qvel[6:].copy()
         self.simulate(self.robot.default_qpos[7:] + config.env.action_scale * action)
@@ -136,11 +138,12 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
 
     def _observe(self) -> Observation:
         """Appends the present frames; returns copies of the histories [K, 59] and [Kp, 89]."""
-        joint_pos, joint_vel = self.data.qpos[7:], self.data.qvel[6:]
+        joint_pos = self.data.qpos[7:] - self.robot.default_qpos[7:]
+        joint_vel = self.data.qvel[6:]
         shared = [self.clock, self.command, joint_pos, joint_vel, self.action]
         actor = np.concatenate([*shared, self.angvel, self.euler]) * self._scale["policy"]
         actor += self._noise * self.rng.standard_normal(len(actor))
-        mass = self.model.body_mass[self.robot.base_body_id]
+        mass = self.model.body_mass[self.robot.trunk_body_id]
         critic = np.concatenate(
             [
                 *shared,
@@ -170,9 +173,14 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
     def _reward(self, last_joint_vel: np.ndarray) -> float:
         """The weighted sum of a dozen terms."""
         c, w, dt = self.config.rewards, self.config.rewards.weights, self.config.control_dt
-        joint_pos, joint_vel = self.data.qpos[7:], self.data.qvel[6:]
+        joint_pos = self.data.qpos[7:] - self.robot.default_qpos[7:]
+        joint_vel = self.data.qvel[6:]
         error = np.linalg.norm(joint_pos - self.reference)
-        height = self.data.qpos[2] - (self.foot_z @ self.stance) / self.stance.sum() + SOLE_DROP
+        height = (
+            self.data.qpos[2]
+            - (self.foot_z @ self.stance) / self.stance.sum()
+            + self.robot.sole_drop
+        )
         momentum = np.linalg.norm(self.data.sensordata[self._momentum]) / c.momentum_scale
         jerk = self.action - self.last_action
         total = (

@@ -20,16 +20,17 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from benchmarks.gym_env import XBot
-from kslc_jax import observations
-from kslc_jax.config import NUM_JOINTS, Config
+from kslc_jax import observations, physics
+from kslc_jax.config import Config
 
 
 def _widths(config: Config) -> dict[str, int]:
     """Widths of the columns of the shared table, which has one row per environment."""
+    robot = physics.robot_for(config.physics)
     return {
-        "policy": config.env.frames * observations.ACTOR_WIDTH,
-        "critic": config.env.privileged_frames * observations.CRITIC_WIDTH,
-        "action": NUM_JOINTS,
+        "policy": config.env.frames * observations.actor_width(robot),
+        "critic": config.env.privileged_frames * observations.critic_width(robot),
+        "action": robot.count,
         "reward": 1,
         "done": 1,
         "time_out": 1,
@@ -72,12 +73,12 @@ def _work(config: Config, raw: Any, rows: range, pipe: Connection) -> None:
 class Workers(VecEnv):
     """All environments as one vectorised environment for rsl_rl."""
 
-    num_actions = NUM_JOINTS
     device = "cpu"
 
     def __init__(self, config: Config, processes: int | None = None):
         self.cfg = {}
         self.num_envs = config.env.num_envs
+        self.num_actions = _widths(config)["action"]
         self.max_episode_length = config.episode_steps
         self.episode_length_buf = torch.zeros(self.num_envs, dtype=torch.long)
         context = multiprocessing.get_context("spawn")

@@ -83,22 +83,30 @@ def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
             "use the version that wrote it, see versions.json"
         )
     require_checksum(meta.get("checksums", {}), "meta", zlib.crc32(_text(meta)))
-    ours = _robot()
+    ours = _robot(_robot_name(meta))
     theirs = meta.get("robot", ours)  # the first schema had none
     if theirs != ours:
         raise CheckpointError(f"it is of another robot, {theirs!r:.80}, not of {ours['name']}")
     return meta
 
 
-def changed_robot(numbers: Fingerprint | None) -> str:
-    """The numbers in which the robot now differs from a stored one, in one line; empty if in none,
-    or if it was not stored."""
-    return changes(numbers, fingerprint()) if numbers else ""
+def changed_robot(meta: dict[str, Any]) -> str:
+    """The numbers in which the robot of a meta item differs now from the stored ones, in one line.
+
+    It is empty if there are none, or if no numbers were stored.
+    """
+    numbers = meta.get(ROBOT_NUMBERS)
+    return changes(numbers, fingerprint(_robot_name(meta))) if numbers else ""
 
 
-def _robot() -> dict[str, Any]:
+def _robot_name(meta: dict[str, Any]) -> str:
+    """`physics.robot` of the stored config; before the field existed, there was one robot."""
+    return meta["config"].get("physics", {}).get("robot", robot_lib.XBOT_L)
+
+
+def _robot(name: str) -> dict[str, Any]:
     """The robot's name and the order of its joints, which give a policy's actions their meaning."""
-    robot = robot_lib.load()
+    robot = robot_lib.load(name=name)
     return {"name": robot.name, "joints": list(robot.joint_names)}
 
 
@@ -112,7 +120,7 @@ def metadata(
     robot that was trained, None if unknown."""
     meta = {
         "schema": SCHEMA_VERSION,
-        "robot": _robot(),
+        "robot": _robot(config.physics.robot),
         "config": config_lib.to_dict(config),
         "metrics": metrics,
     }

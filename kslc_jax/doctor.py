@@ -102,15 +102,15 @@ def _joint_angles(engine: Literal["mujoco", "mjx"]):
     import jax.numpy as jnp
 
     from kslc_jax import physics, randomize
-    from kslc_jax.config import NUM_JOINTS
 
     config = PhysicsConfig(engine=engine, iterations=10, ls_iterations=10)
-    home = jnp.asarray(physics.robot_for(config).default_qpos, jnp.float32)
+    robot = physics.robot_for(config)
+    home = jnp.asarray(robot.default_qpos, jnp.float32)
     start = physics.initial_state(config, home, jnp.zeros(home.size - 1))
 
     def one(state: Any, t: jax.Array) -> tuple[Any, None]:
-        target = home[7:] + 0.05 * jnp.sin(0.2 * t + jnp.arange(NUM_JOINTS))
-        return physics.step(config, state, target, randomize.nominal(), 1.0), None
+        target = home[7:] + 0.05 * jnp.sin(0.2 * t + jnp.arange(robot.count))
+        return physics.step(config, state, target, randomize.nominal(robot), 1.0), None
 
     run = jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(AGREEMENT_STEPS))[0])
     return jax.device_get(run(start).qpos[7:])
@@ -121,7 +121,8 @@ def check_renderer() -> str:
     code = (
         "from kslc_jax import runtime; runtime.prepare();"
         "from kslc_jax import robot; from kslc_jax.viewer import render; import os;"
-        "next(render.frames(robot.load('high').default_qpos[None])); print(os.environ['MUJOCO_GL'])"
+        "xbot = robot.load('high');"
+        "next(render.frames(xbot, xbot.default_qpos[None])); print(os.environ['MUJOCO_GL'])"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from kslc_jax import commands, gait, maths, observations, physics, randomize, rewards, signals
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax.commands import Command
-from kslc_jax.config import NUM_JOINTS, Config
+from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.gait import GaitState
 from kslc_jax.physics import PhysicsState
@@ -66,22 +66,24 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     keys = jax.random.split(key, 6)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
-    joints = jax.random.uniform(keys[0], (NUM_JOINTS,), minval=-noise, maxval=noise)
+    joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
     qpos = jnp.asarray(robot.default_qpos, jnp.float32).at[7:].add(joints)
     state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
     now = signals.read(robot, state)
     command = _sample_command(config, keys[1], curriculum, now)
     blank = EnvState(
         physics=state,
-        dynamics=randomize.sample(config.randomize, keys[2]),
+        dynamics=randomize.sample(config.randomize, robot, keys[2]),
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
         command_since=jnp.zeros((), jnp.int32),
         command_until=commands.holding_steps(config.command, keys[5], config.control_dt),
-        history=jnp.zeros((config.env.frames, observations.ACTOR_WIDTH)),
-        privileged_history=jnp.zeros((config.env.privileged_frames, observations.CRITIC_WIDTH)),
-        last_action=jnp.zeros(NUM_JOINTS),
-        last_last_action=jnp.zeros(NUM_JOINTS),
+        history=jnp.zeros((config.env.frames, observations.actor_width(robot))),
+        privileged_history=jnp.zeros(
+            (config.env.privileged_frames, observations.critic_width(robot))
+        ),
+        last_action=jnp.zeros(robot.count),
+        last_last_action=jnp.zeros(robot.count),
         last_base_velocity=jnp.zeros(6),
         push=jnp.zeros(5),
         time=jnp.zeros((), jnp.int32),
@@ -272,10 +274,10 @@ def _observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> E
         reference=gait.reference_pose(config.gait, robot, state.gait, state.command),
         last_action=state.last_action,
         push=state.push,
-        base_mass=robot.mj_model.body_mass[robot.base_body_id] + state.dynamics.base_mass,
+        base_mass=robot.mj_model.body_mass[robot.trunk_body_id] + state.dynamics.base_mass,
     )
-    frame = observations.actor_frame(config.env, src, key)
-    privileged = observations.critic_frame(config.env, src)
+    frame = observations.actor_frame(config.env, robot, src, key)
+    privileged = observations.critic_frame(config.env, robot, src)
     return state.replace(
         history=observations.append_frame(state.history, frame),
         privileged_history=observations.append_frame(state.privileged_history, privileged),

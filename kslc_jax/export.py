@@ -23,7 +23,7 @@ import numpy as np
 import tyro
 
 from kslc_jax import __version__, cli, files
-from kslc_jax.config import NUM_JOINTS, Config, ConfigError
+from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
     from kslc_jax import commands, motors, observations, physics
 
     config, robot = policy.config, physics.robot_for(policy.config.physics)
+    table = observations.actor_table(robot)
     held = robot.is_arm & (config.env.arms == "held")
     return {
         "metadata_version": METADATA_VERSION,
@@ -93,7 +94,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
         "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],
         "history_length": config.env.frames,
         "observation_clip": config.env.observation_clip,
-        "frame": [{"name": c.name, "width": c.width, "scale": c.scale} for c in observations.ACTOR],
+        "frame": [{"name": c.name, "width": c.width, "scale": c.scale} for c in table],
         "gait": {
             "cycle_time": float(policy.curriculum.cycle_time),
             "v_max": float(policy.curriculum.v_max),
@@ -127,7 +128,7 @@ def dense_layers(
     """
     import jax
 
-    from kslc_jax import networks, observations
+    from kslc_jax import networks, observations, physics
 
     weights = jax.tree.map(lambda x: np.asarray(x, np.float64), params[network])
     layers = [weights[f"Dense_{i}"] for i in range(len(weights))]
@@ -137,11 +138,12 @@ def dense_layers(
     def pairs(size: int) -> Parity:
         return networks.parity(np.roll(np.arange(size), size // 2), np.ones(size))
 
-    frame = networks.parity(*observations.mirror_map(observations.ACTOR))
+    robot = physics.robot_for(config.physics)
+    frame = networks.mirrored_frame(observations.actor_table(robot), robot)
     inputs, outputs = [frame] * config.env.frames, networks.mirrored_velocity()
     if network == "actor":
         inputs += [outputs] if config.network.estimator else []
-        outputs = networks.mirrored_joints()
+        outputs = networks.mirrored_joints(robot)
     bases = [_stacked(inputs), *map(pairs, getattr(config.network, network)), outputs]
     return [
         (
@@ -165,8 +167,6 @@ def _stacked(parts: list[Parity]) -> Parity:
 def to_onnx(policy: Policy) -> bytes:
     """The network as ONNX: Flatten, then Gemm with Elu between; metadata as JSON values. An
     estimator comes first, and Concat puts what it says behind the flat history."""
-    from kslc_jax import observations
-
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError as error:
@@ -197,8 +197,8 @@ def to_onnx(policy: Policy) -> bytes:
         nodes.append(helper.make_node("Concat", ["flat", "velocity"], ["seen"], axis=1))
         seen = "seen"
     add("actor", seen, "action")
-    history = floats("history", "batch", policy.config.env.frames, observations.ACTOR_WIDTH)
-    action = floats("action", "batch", NUM_JOINTS)
+    history = floats("history", "batch", *policy.init().history.shape)
+    action = floats("action", "batch", len(metadata(policy)["joint_names"]))
     model = helper.make_model(
         helper.make_graph(nodes, "policy", [history], [action], weights),
         opset_imports=[helper.make_opsetid("", _OPSET)],
@@ -228,10 +228,8 @@ def to_stablehlo(policy: Policy) -> bytes:
     import jax.export
     import jax.numpy as jnp
 
-    from kslc_jax import observations
-
     (batch,) = jax.export.symbolic_shape("batch")
-    shape = (batch, policy.config.env.frames, observations.ACTOR_WIDTH)
+    shape = (batch, *policy.init().history.shape)
     export = jax.export.export(jax.jit(jax.vmap(policy.act_on)), platforms=("cpu", "cuda", "tpu"))
     return bytes(export(jax.ShapeDtypeStruct(shape, jnp.float32)).serialize())
 

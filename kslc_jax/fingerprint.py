@@ -52,9 +52,12 @@ _OPTIONS = ("gravity", "integrator", "cone", "solver", "impratio", "tolerance", 
 """Options of the simulation that are not in `PhysicsConfig`."""
 
 
-def fingerprint() -> Fingerprint:
-    """The numbers of the installed robot."""
-    robots = {fidelity: robot_lib.load(fidelity) for fidelity in FIDELITIES}
+def fingerprint(name: str) -> Fingerprint:
+    """The numbers that a robot has now.
+
+    `name` is that of a shipped robot, or the path of a description.
+    """
+    robots = {fidelity: robot_lib.load(fidelity, name=name) for fidelity in FIDELITIES}
     return {
         "values": _values(robots["train"]),
         "digests": {fidelity: _digests(robot) for fidelity, robot in robots.items()},

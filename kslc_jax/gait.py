@@ -10,17 +10,14 @@ from kslc_jax.config import Config, GaitConfig
 from kslc_jax.robot import Robot
 from kslc_jax.signals import Signals
 
-SOLE_DROP = 0.05
-"""Height of the ankle-roll link above the sole [m] (Humanoid-Gym)."""
-
-# Reference motion of the left side: each joint's share of an amplitude. LEG is the swing of a leg
-# (HG), _HIP the stride sweep, _ARM the arm swing, _ELBOW the elbow bend. On the left, a negative
-# leg_pitch moves the leg forward, a negative knee bends it, and a positive shoulder_pitch moves the
-# arm back. The joint axes of the right side are mirrored: signs are opposite there.
-LEG = {"leg_pitch": 1.0, "knee": 2.0, "ankle_pitch": 1.0}
-_HIP = {"leg_pitch": 1.0}
-_ARM = {"shoulder_pitch": 1.0}
-_ELBOW = {"elbow_pitch": 1.0}
+# Reference motion of the left side: each joint's share of an amplitude, as a rotation about the y
+# axis of the base. A negative rotation moves a hanging limb forward; a positive one bends the knee.
+# LEG is the swing of a leg (HG), _HIP the stride sweep, _ARM the arm swing, _ELBOW the elbow bend.
+# The right side moves half a cycle later: signs are opposite there.
+LEG = {"hip": 1.0, "knee": -2.0, "ankle": 1.0}
+_HIP = {"hip": 1.0}
+_ARM = {"shoulder": 1.0}
+_ELBOW = {"elbow": -1.0}
 
 
 @flax.struct.dataclass
@@ -133,7 +130,8 @@ def cycle_time(config: Config, command: Command, curriculum_cycle, v_max) -> jax
 def reference_pose(
     config: GaitConfig, robot: Robot, state: GaitState, command: Command
 ) -> jax.Array:
-    """Reference joint angles [16, rad]: Humanoid-Gym's, with optional parts that grow with speed.
+    """Reference joint angles [n, rad], from the home pose: Humanoid-Gym's, with optional parts
+    that grow with speed. They stay within the limits of the joints.
 
     The swing leg follows a half sine (HG). With `stride_sweep` the hips follow the cosine. With
     `arm_swing` the arms follow it in the opposite direction of the leg on the same side. With
@@ -152,12 +150,18 @@ def reference_pose(
     elbows = pattern(robot, "left", _ELBOW) - pattern(robot, "right", _ELBOW)
     swing_of_arms = config.arm_swing_slow + share * (config.arm_swing - config.arm_swing_slow)
     sweep = c * (swing_of_arms * arms - share * config.stride_sweep * hips)
-    return pose + sweep + share * config.elbow_bend * elbows
+    lower, upper = robot.reference_range
+    return jnp.clip(pose + sweep + share * config.elbow_bend * elbows, lower, upper)
 
 
 def pattern(robot: Robot, side: str, shares: dict[str, float]) -> np.ndarray:
-    """[16] the share of each named joint of one side; zero for all other joints."""
-    values = np.zeros(len(robot.joint_names))
+    """[n] joint angles that rotate the named joints of one side about y by their shares.
+
+    All other joints are zero. On the right side the sign is opposite. A robot may lack arms.
+    """
+    values = np.zeros(robot.count)
     for joint, share in shares.items():
-        values[robot.joint_names.index(f"{side}_{joint}_joint")] = share
+        at = robot.anatomy.roles.get(f"{side}_{joint}")
+        if at is not None:
+            values[at] = share * robot.anatomy.pitch[at] * (1.0 if side == "left" else -1.0)
     return values

@@ -24,7 +24,7 @@ from typing import Any
 import tyro
 
 from kslc_jax import cli, evaluate, files
-from kslc_jax.config import HighFidelity, require_seed
+from kslc_jax.config import require_seed
 from kslc_jax.evaluation import tables
 from kslc_jax.evaluation.bars import Bar, bars
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
@@ -114,7 +114,7 @@ def _speeds(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     from kslc_jax.evaluation.measure import measure as measured
 
     size = args.size
-    plain = trials.Setting(HighFidelity(), seconds=size.seconds)
+    plain = trials.Setting(trials.engine(policy, "high"), seconds=size.seconds)
 
     def told(share: float) -> None:
         progress("speeds", share)
@@ -132,7 +132,9 @@ def _schedules(args: Args, policy, progress: Progress) -> dict[str, list[dict[st
         def told(share: float, i: int = i) -> None:
             progress("schedules", (i + share) / len(size.headings))
 
-        setting = trials.Setting(HighFidelity(), seconds=size.schedule_seconds, heading=heading)
+        setting = trials.Setting(
+            trials.engine(policy, "high"), seconds=size.schedule_seconds, heading=heading
+        )
         found[f"heading={heading:.2f}"] = scheduled.measure(
             policy, setting, [schedule], size.schedule_robots, args.seed, told
         )
@@ -147,7 +149,7 @@ def _perturbed(args: Args, policy, progress: Progress) -> dict[str, list[dict[st
         return gait_metrics.speed(trace, command, dt)
 
     size, found = args.size, {}
-    plain = trials.Setting(HighFidelity(), seconds=size.perturbed_seconds)
+    plain = trials.Setting(trials.engine(policy, "high"), seconds=size.perturbed_seconds)
     for i, condition in enumerate(size.perturbations):
 
         def told(share: float, i: int = i) -> None:
@@ -167,7 +169,7 @@ def _drake(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
 
     size = args.size
     setting = trials.Setting(
-        HighFidelity(), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
+        trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
     )
     speeds = [speed for speed in size.speeds if speed <= 4.0]
     return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))

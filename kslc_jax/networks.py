@@ -14,7 +14,8 @@ import numpy as np
 
 from kslc_jax import observations
 from kslc_jax import robot as robot_lib
-from kslc_jax.config import NUM_JOINTS, Config
+from kslc_jax.config import Config
+from kslc_jax.robot import Robot
 
 Params = dict[str, Any]
 """{'actor': flax params, 'critic': flax params, 'log_std': [16]}, and 'estimator': flax params if
@@ -140,25 +141,35 @@ class Gaussian:
         return jnp.sum(per_joint, axis=-1)
 
 
+def _robot(config: Config) -> Robot:
+    return robot_lib.load(name=config.physics.robot)
+
+
 def _actor(config: Config) -> nn.Module:
-    scale = config.network.init_mean
+    scale, robot = config.network.init_mean, _robot(config)
     if not config.network.symmetric:
-        return MLP(config.network.actor, NUM_JOINTS, scale)
-    inputs, outputs = parity(*observations.mirror_map(observations.ACTOR)), mirrored_joints()
+        return MLP(config.network.actor, robot.count, scale)
     beside = (mirrored_velocity(),) if config.network.estimator else ()
+    inputs, outputs = mirrored_frame(observations.actor_table(robot), robot), mirrored_joints(robot)
     return MirrorMLP(config.network.actor, inputs, outputs, scale, beside)
 
 
 def _estimator(config: Config) -> nn.Module:
     if not config.network.symmetric:
         return MLP(config.network.estimator, ESTIMATED, 1.0)
-    inputs = parity(*observations.mirror_map(observations.ACTOR))
+    robot = _robot(config)
+    inputs = mirrored_frame(observations.actor_table(robot), robot)
     return MirrorMLP(config.network.estimator, inputs, mirrored_velocity(), 1.0)
 
 
-def mirrored_joints() -> Parity:
-    """Bases for the joint vector [16]."""
-    return parity(*robot_lib.mirror_joints())
+def mirrored_frame(table: observations.Table, robot: Robot) -> Parity:
+    """Bases for a frame [W]."""
+    return parity(*observations.mirror_map(table, robot))
+
+
+def mirrored_joints(robot: Robot) -> Parity:
+    """Bases for the joint vector [n]."""
+    return parity(robot.anatomy.permutation, robot.anatomy.sign)
 
 
 def mirrored_velocity() -> Parity:
@@ -169,20 +180,22 @@ def mirrored_velocity() -> Parity:
 def _critic(config: Config) -> nn.Module:
     if not config.network.symmetric:
         return MLP(config.network.critic, 1, 1.0)
-    inputs = parity(*observations.mirror_map(observations.CRITIC))
+    robot = _robot(config)
+    inputs = mirrored_frame(observations.critic_table(robot), robot)
     return MirrorMLP(config.network.critic, inputs, parity(np.zeros(1, int), np.ones(1)), 1.0)
 
 
 def init(config: Config, key: jax.Array) -> Params:
     """Random initial parameters."""
     key_actor, key_critic = jax.random.split(key)
+    robot = _robot(config)
     beside = (jnp.zeros(ESTIMATED),) if config.network.estimator else ()
-    history = jnp.zeros((config.env.frames, observations.ACTOR_WIDTH))
-    privileged = jnp.zeros((config.env.privileged_frames, observations.CRITIC_WIDTH))
+    history = jnp.zeros((config.env.frames, observations.actor_width(robot)))
+    privileged = jnp.zeros((config.env.privileged_frames, observations.critic_width(robot)))
     params = {
         "actor": _actor(config).init(key_actor, history, *beside)["params"],
         "critic": _critic(config).init(key_critic, privileged)["params"],
-        "log_std": jnp.full(NUM_JOINTS, jnp.log(config.network.init_std), jnp.float32),
+        "log_std": jnp.full(robot.count, jnp.log(config.network.init_std), jnp.float32),
     }
     if config.network.estimator:
         key_estimator = jax.random.fold_in(key_actor, 1)
@@ -217,8 +230,7 @@ def log_std(config: Config, params: Params) -> jax.Array:
     free = params["log_std"]
     if not config.network.symmetric:
         return free
-    joints, _ = robot_lib.mirror_joints()
-    return 0.5 * (free + free[joints])
+    return 0.5 * (free + free[_robot(config).anatomy.permutation])
 
 
 def value(config: Config, params: Params, privileged: jax.Array) -> jax.Array:

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import robot as robot_lib
 from kslc_jax.commands import Command
-from kslc_jax.config import NUM_JOINTS, EnvConfig
+from kslc_jax.config import EnvConfig
 from kslc_jax.gait import GaitState
 from kslc_jax.randomize import Dynamics
+from kslc_jax.robot import Robot
 from kslc_jax.signals import Signals
 
 Mirror = Literal["negate", "keep", "joints", "swap", "polar", "axial", "command"]
@@ -28,7 +28,7 @@ POLAR = (1, -1, 1)
 _SIGNS = {"polar": POLAR, "axial": (-1, 1, -1), "command": (1, -1, -1)}
 
 MASS_SCALE = 30.0
-"""Mass [kg] of the base link that the critic sees as 1."""
+"""Mass [kg] of XBot-L's trunk that the critic sees as 1. It scales with the mass of a robot."""
 
 
 @dataclass(frozen=True)
@@ -46,50 +46,69 @@ class Component:
     mirror: Mirror
 
 
-ACTOR: tuple[Component, ...] = (
-    Component("clock", 2, 1.0, 0.0, "negate"),
-    Component("command", 3, (2.0, 2.0, 1.0), 0.0, "command"),
-    Component("joint_pos", NUM_JOINTS, 1.0, 0.05, "joints"),
-    Component("joint_vel", NUM_JOINTS, 0.05, 0.5, "joints"),
-    Component("last_action", NUM_JOINTS, 1.0, 0.0, "joints"),
-    Component("base_angvel", 3, 1.0, 0.1, "axial"),
-    Component("base_euler", 3, 1.0, 0.03, "axial"),
-)
-CRITIC: tuple[Component, ...] = (
-    Component("clock", 2, 1.0, 0.0, "negate"),
-    Component("command", 3, (2.0, 2.0, 1.0), 0.0, "command"),
-    Component("joint_pos", NUM_JOINTS, 1.0, 0.0, "joints"),
-    Component("joint_vel", NUM_JOINTS, 0.05, 0.0, "joints"),
-    Component("last_action", NUM_JOINTS, 1.0, 0.0, "joints"),
-    Component("tracking_difference", NUM_JOINTS, 1.0, 0.0, "joints"),
-    Component("base_linvel", 3, 2.0, 0.0, "polar"),
-    Component("base_angvel", 3, 1.0, 0.0, "axial"),
-    Component("base_euler", 3, 1.0, 0.0, "axial"),
-    Component("push_linear", 2, 1.0, 0.0, "polar"),
-    Component("push_angular", 3, 1.0, 0.0, "axial"),
-    Component("friction", 1, 1.0, 0.0, "keep"),
-    Component("base_mass", 1, 1.0 / MASS_SCALE, 0.0, "keep"),
-    Component("stance", 2, 1.0, 0.0, "swap"),
-    Component("contact", 2, 1.0, 0.0, "swap"),
-)
+Table = tuple[Component, ...]
 
 
-def width(table: tuple[Component, ...]) -> int:
+@functools.lru_cache(maxsize=32)
+def actor_table(robot: Robot) -> Table:
+    """Components of the actor's frame: 11 + 3 n values for n joints, 59 for XBot-L."""
+    n = robot.count
+    return (
+        Component("clock", 2, 1.0, 0.0, "negate"),
+        Component("command", 3, (2.0, 2.0, 1.0), 0.0, "command"),
+        Component("joint_pos", n, 1.0, 0.05, "joints"),
+        Component("joint_vel", n, 0.05, 0.5, "joints"),
+        Component("last_action", n, 1.0, 0.0, "joints"),
+        Component("base_angvel", 3, 1.0, 0.1, "axial"),
+        Component("base_euler", 3, 1.0, 0.03, "axial"),
+    )
+
+
+@functools.lru_cache(maxsize=32)
+def critic_table(robot: Robot) -> Table:
+    """Components of the critic's frame: 25 + 4 n values for n joints, 89 for XBot-L."""
+    n = robot.count
+    return (
+        Component("clock", 2, 1.0, 0.0, "negate"),
+        Component("command", 3, (2.0, 2.0, 1.0), 0.0, "command"),
+        Component("joint_pos", n, 1.0, 0.0, "joints"),
+        Component("joint_vel", n, 0.05, 0.0, "joints"),
+        Component("last_action", n, 1.0, 0.0, "joints"),
+        Component("tracking_difference", n, 1.0, 0.0, "joints"),
+        Component("base_linvel", 3, 2.0, 0.0, "polar"),
+        Component("base_angvel", 3, 1.0, 0.0, "axial"),
+        Component("base_euler", 3, 1.0, 0.0, "axial"),
+        Component("push_linear", 2, 1.0, 0.0, "polar"),
+        Component("push_angular", 3, 1.0, 0.0, "axial"),
+        Component("friction", 1, 1.0, 0.0, "keep"),
+        Component("base_mass", 1, 1.0 / (MASS_SCALE * robot.mass_ratio), 0.0, "keep"),
+        Component("stance", 2, 1.0, 0.0, "swap"),
+        Component("contact", 2, 1.0, 0.0, "swap"),
+    )
+
+
+def width(table: Table) -> int:
     """Width of a frame: the number of its values."""
     return sum(c.width for c in table)
 
 
-ACTOR_WIDTH = width(ACTOR)
-CRITIC_WIDTH = width(CRITIC)
+def actor_width(robot: Robot) -> int:
+    """Width of the actor's frame."""
+    return width(actor_table(robot))
 
 
-def slices(table: tuple[Component, ...]) -> dict[str, slice]:
+def critic_width(robot: Robot) -> int:
+    """Width of the critic's frame."""
+    return width(critic_table(robot))
+
+
+def slices(table: Table) -> dict[str, slice]:
     """Slice of each component in its frame, by name."""
     ends = np.cumsum([c.width for c in table])
     return {c.name: slice(int(e) - c.width, int(e)) for c, e in zip(table, ends, strict=True)}
 
 
-def row(table: tuple[Component, ...], field: str) -> np.ndarray:
+def row(table: Table, field: str) -> np.ndarray:
     """[W] the named field ("scale" or "noise") of the component that each value belongs to."""
     parts = [np.broadcast_to(getattr(c, field), (c.width,)) for c in table]
     return np.concatenate(parts).astype(np.float32)
@@ -106,7 +125,7 @@ class Sources:
     reference: jax.Array  # [16] rad
     last_action: jax.Array  # [16]
     push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
-    base_mass: jax.Array  # [] kg, mass of the base link
+    base_mass: jax.Array  # [] kg, mass of the trunk
 
 
 def _values(src: Sources) -> dict[str, jax.Array]:
@@ -131,24 +150,25 @@ def _values(src: Sources) -> dict[str, jax.Array]:
     }
 
 
-def _frame(table: tuple[Component, ...], src: Sources) -> jax.Array:
+def _frame(table: Table, src: Sources) -> jax.Array:
     """[W] the scaled components of the table, without noise."""
     values = _values(src)
     return jnp.concatenate([values[c.name] for c in table]) * row(table, "scale")
 
 
-def actor_frame(config: EnvConfig, src: Sources, key: jax.Array) -> jax.Array:
-    """Actor frame [59] with noise, clipped. The noise is scaled like its component (HG)."""
-    frame = _frame(ACTOR, src)
+def actor_frame(config: EnvConfig, robot: Robot, src: Sources, key: jax.Array) -> jax.Array:
+    """Actor frame [W] with noise, clipped. The noise is scaled like its component (HG)."""
+    table = actor_table(robot)
+    frame = _frame(table, src)
     level = config.noise_level * src.dynamics.noise
-    scale = level * row(ACTOR, "noise") * row(ACTOR, "scale")
+    scale = level * row(table, "noise") * row(table, "scale")
     frame = frame + scale * jax.random.normal(key, frame.shape)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 
 
-def critic_frame(config: EnvConfig, src: Sources) -> jax.Array:
-    """Critic frame [89] without noise, clipped."""
-    frame = _frame(CRITIC, src)
+def critic_frame(config: EnvConfig, robot: Robot, src: Sources) -> jax.Array:
+    """Critic frame [W] without noise, clipped."""
+    frame = _frame(critic_table(robot), src)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 
 
@@ -163,10 +183,10 @@ def append_frame(history: jax.Array, frame: jax.Array) -> jax.Array:
 # ----------------------------------------------------------------------------------------- mirror
 
 
-@functools.lru_cache(maxsize=8)
-def mirror_map(table: tuple[Component, ...]) -> tuple[np.ndarray, np.ndarray]:
+@functools.lru_cache(maxsize=32)
+def mirror_map(table: Table, robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """(permutation [W], sign [W]): frame[permutation] * sign is the frame of the mirrored robot."""
-    joints, joint_sign = robot_lib.mirror_joints()
+    joints, joint_sign = robot.anatomy.permutation, robot.anatomy.sign
     permutation, sign = np.arange(width(table)), np.ones(width(table), np.float32)
     for c in table:
         at = slices(table)[c.name]

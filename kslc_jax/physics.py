@@ -52,6 +52,7 @@ def robot_for(config: PhysicsConfig) -> Robot:
     """The robot with the config's fidelity, timestep and solver settings (cached)."""
     return robot_lib.load(
         config.fidelity,
+        name=config.robot,
         timestep=config.timestep,
         iterations=config.iterations,
         ls_iterations=config.ls_iterations,

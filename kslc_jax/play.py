@@ -154,7 +154,7 @@ def film_writer():
     return imageio
 
 
-def film(args: Args, trace, spans: Sequence[range], every: int, dt: float) -> Iterator:
+def film(args: Args, robot, trace, spans: Sequence[range], every: int, dt: float) -> Iterator:
     """Pictures [H, W, 3] of every `every`-th step of the spans, one speed after the other.
 
     Each picture shows the commanded and the actual speed as text.
@@ -164,24 +164,24 @@ def film(args: Args, trace, spans: Sequence[range], every: int, dt: float) -> It
     window = round(SPEED_SECONDS / dt)
     for i, (command, steps) in enumerate(zip(args.speeds, spans, strict=True)):
         filmed = steps[::every]
-        for step, picture in zip(filmed, render.frames(trace.qpos[filmed, i]), strict=True):
+        for step, picture in zip(filmed, render.frames(robot, trace.qpos[filmed, i]), strict=True):
             speed = trace.linvel[max(0, step + 1 - window) : step + 1, i, 0].mean()
             text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
             yield caption(picture, text)
 
 
-def write_video(path: Path, args: Args, trace, spans: Sequence[range], dt: float) -> None:
+def write_video(path: Path, args: Args, robot, trace, spans: Sequence[range], dt: float) -> None:
     """Writes the film, which plays in real time. The suffix of `path` decides the format."""
     if path.suffix.lower() in ANIMATIONS:
         every = max(1, round(2.0 / (FPS * dt)))
-        write_animation(path, film(args, trace, spans, every, dt), every * dt)
+        write_animation(path, film(args, robot, trace, spans, every, dt), every * dt)
         return
     imageio = film_writer()
     # The warning is harmless here: the fork starts ffmpeg at once and runs no JAX.
     warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
     every = max(1, round(1.0 / (FPS * dt)))
     with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as out:
-        for picture in film(args, trace, spans, every, dt):
+        for picture in film(args, robot, trace, spans, every, dt):
             out.append_data(picture)
 
 
@@ -199,6 +199,7 @@ def draw(args: Args, policy) -> None:
     """Writes the gait strip and the video that `args` names."""
     import matplotlib.image
 
+    from kslc_jax import robot as robot_lib
     from kslc_jax.viewer import render
 
     for path in (args.gait_strip, args.video):
@@ -206,16 +207,17 @@ def draw(args: Args, policy) -> None:
     if args.video is not None and args.video.suffix.lower() in FILMS:
         film_writer()
     trace, start, dt = record(args, policy)
+    robot = robot_lib.load("high", name=policy.config.physics.robot)
     for speed, up in zip(args.speeds, trace.alive[-1], strict=True):
         if not up:
             print(f"warning: fell at {speed:g} m/s; what is shown ends there")
     spans = [shown(trace.alive[:, i], start) for i in range(len(args.speeds))]
     if args.gait_strip is not None:
-        strips = [render.gait_strip(trace.qpos[span, i], dt) for i, span in enumerate(spans)]
+        strips = [render.gait_strip(robot, trace.qpos[span, i], dt) for i, span in enumerate(spans)]
         matplotlib.image.imsave(args.gait_strip, render.stack(strips))
         print(f"wrote {args.gait_strip}")
     if args.video is not None:
-        write_video(args.video, args, trace, spans, dt)
+        write_video(args.video, args, robot, trace, spans, dt)
         print(f"wrote {args.video}")
 
 

@@ -13,6 +13,7 @@ import orbax.checkpoint as ocp
 from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import files, networks, observations
+from kslc_jax import robot as robot_lib
 from kslc_jax.checkpoint_format import (
     ROBOT_NUMBERS,
     CheckpointError,
@@ -53,7 +54,8 @@ class Policy:
 
     def init(self) -> PolicyState:
         """Memory before the first frame."""
-        return PolicyState(jnp.zeros((self.config.env.frames, observations.ACTOR_WIDTH)))
+        width = observations.actor_width(robot_lib.load(name=self.config.physics.robot))
+        return PolicyState(jnp.zeros((self.config.env.frames, width)))
 
     def act(self, state: PolicyState, frame: jax.Array) -> tuple[PolicyState, jax.Array]:
         """Deterministic action [16] for the newest actor frame [59]."""
@@ -90,7 +92,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
             params = reader.restore(folder, args=args)["params"]
             require_checksum(meta.get("checksums", {}), "params", checksum(params))
             trained = meta.get(ROBOT_NUMBERS)
-            changed = changed_robot(trained)
+            changed = changed_robot(meta)
         except Exception as error:  # damaged metadata can lead orbax anywhere
             raise CheckpointError(
                 f"{folder} is no readable checkpoint: {first_line(error)}"

@@ -4,11 +4,8 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax.config import NUM_JOINTS, RandomizeConfig, Range
+from kslc_jax.config import RandomizeConfig, Range
 from kslc_jax.robot import Robot
-
-LINKS = NUM_JOINTS + 1
-"""Number of randomised links: the base, and the link after each joint."""
 
 
 @flax.struct.dataclass
@@ -16,8 +13,8 @@ class Dynamics:
     """Physical parameters of one episode."""
 
     friction: jax.Array  # [] sliding friction of the feet, not yet averaged with the ground
-    base_mass: jax.Array  # [] kg added to the base link
-    base_com: jax.Array  # [3] m, shift of the base link's centre of mass, base frame
+    base_mass: jax.Array  # [] kg added to the trunk
+    base_com: jax.Array  # [3] m, shift of the trunk's centre of mass, trunk frame
     kp: jax.Array  # [16] factor on the position gain
     kd: jax.Array  # [16] factor on the velocity gain
     motor_strength: jax.Array  # [16] factor on the available torque
@@ -28,26 +25,28 @@ class Dynamics:
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
 
 
-def nominal(friction: float = 1.0) -> Dynamics:
+def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
     """Parameters of the model file, without randomisation."""
+    joints, links = robot.count, robot.count + 1
     return Dynamics(
         friction=jnp.asarray(friction),
         base_mass=jnp.zeros(()),
         base_com=jnp.zeros(3),
-        kp=jnp.ones(NUM_JOINTS),
-        kd=jnp.ones(NUM_JOINTS),
-        motor_strength=jnp.ones(NUM_JOINTS),
-        joint_friction=jnp.zeros(NUM_JOINTS),
-        link_mass=jnp.ones(LINKS),
-        link_com=jnp.zeros((LINKS, 3)),
+        kp=jnp.ones(joints),
+        kd=jnp.ones(joints),
+        motor_strength=jnp.ones(joints),
+        joint_friction=jnp.zeros(joints),
+        link_mass=jnp.ones(links),
+        link_com=jnp.zeros((links, 3)),
         hand_mass=jnp.zeros(()),
         noise=jnp.ones(()),
     )
 
 
-def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
+def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
     """Draws the parameters of one episode. Each is uniform in its configured range."""
     keys = jax.random.split(key, 11)
+    joints, links = (robot.count,), (robot.count + 1,)
 
     def uniform(key: jax.Array, bounds: Range, shape: tuple[int, ...] = ()) -> jax.Array:
         return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
@@ -56,12 +55,12 @@ def sample(config: RandomizeConfig, key: jax.Array) -> Dynamics:
         friction=uniform(keys[0], config.friction),
         base_mass=uniform(keys[1], config.base_mass),
         base_com=uniform(keys[2], config.base_com, (3,)),
-        kp=uniform(keys[3], config.kp, (NUM_JOINTS,)),
-        kd=uniform(keys[4], config.kd, (NUM_JOINTS,)),
-        motor_strength=uniform(keys[5], config.motor_strength, (NUM_JOINTS,)),
-        joint_friction=uniform(keys[6], config.joint_friction, (NUM_JOINTS,)),
-        link_mass=uniform(keys[8], config.link_mass, (LINKS,)),
-        link_com=uniform(keys[9], config.link_com, (LINKS, 3)),
+        kp=uniform(keys[3], config.kp, joints),
+        kd=uniform(keys[4], config.kd, joints),
+        motor_strength=uniform(keys[5], config.motor_strength, joints),
+        joint_friction=uniform(keys[6], config.joint_friction, joints),
+        link_mass=uniform(keys[8], config.link_mass, links),
+        link_com=uniform(keys[9], config.link_com, (*links, 3)),
         hand_mass=uniform(keys[10], config.hand_mass),
         noise=uniform(keys[7], config.noise),
     )
@@ -72,7 +71,7 @@ def link_masses(robot: Robot, dynamics: Dynamics) -> jax.Array:
     mass = (
         jnp.asarray(robot.mj_model.body_mass).at[robot.link_body_ids].multiply(dynamics.link_mass)
     )
-    mass = mass.at[robot.base_body_id].add(dynamics.base_mass)
+    mass = mass.at[robot.trunk_body_id].add(dynamics.base_mass)
     return mass.at[robot.hand_body_ids].add(dynamics.hand_mass)
 
 
@@ -89,7 +88,7 @@ def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> di
     derived constants keep their nominal values in both engines: they only scale the contact
     regularisation.
     """
-    model, base, links = robot.mj_model, robot.base_body_id, robot.link_body_ids
+    model, trunk, links = robot.mj_model, robot.trunk_body_id, robot.link_body_ids
     contact_friction = 0.5 * (dynamics.friction + ground_friction)
     mass = link_masses(robot, dynamics)
     com = jnp.asarray(model.body_ipos).at[links].add(dynamics.link_com)
@@ -100,6 +99,6 @@ def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> di
         .set(contact_friction),
         "body_mass": mass,
         "body_inertia": jnp.asarray(model.body_inertia).at[1:].multiply(scale[:, None]),
-        "body_ipos": com.at[base].add(dynamics.base_com),
+        "body_ipos": com.at[trunk].add(dynamics.base_com),
         "body_subtreemass": jnp.sum(robot.subtree * mass, axis=1),
     }

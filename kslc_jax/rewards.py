@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from kslc_jax.commands import Command, speed_share
 from kslc_jax.config import RewardConfig
-from kslc_jax.gait import SOLE_DROP, GaitState
+from kslc_jax.gait import GaitState
 from kslc_jax.maths import norm, quat_rotate_inverse
 from kslc_jax.robot import Robot
 from kslc_jax.signals import Signals
@@ -61,7 +61,7 @@ def base_height(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
     stance = x.gait.stance.astype(jnp.float32)
     feet = jnp.sum(x.signals.foot_pos[:, 2] * stance) / jnp.maximum(jnp.sum(stance), 1.0)
     # In a flight phase of the clock there is no stance foot: h is then above the floor.
-    sole = jnp.where(jnp.any(x.gait.stance), feet - SOLE_DROP, 0.0)
+    sole = jnp.where(jnp.any(x.gait.stance), feet - robot.sole_drop, 0.0)
     height = x.signals.base_pos[2] - sole
     drop = cfg.base_height_drop * speed_share(x.command, x.v_max) if cfg.velocity_rewards else 0.0
     target = cfg.base_height_target * (1.0 - drop)
@@ -223,8 +223,7 @@ def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> 
     x [rad] is the size of (roll, yaw) of the left leg plus that of the right leg.
     """
     q = x.signals.joint_pos
-    left, right = (robot.joint_names.index(f"{side}_leg_roll_joint") for side in ("left", "right"))
-    legs = norm(q[left : left + 2]) + norm(q[right : right + 2])
+    legs = sum(norm(q[jnp.array(robot.roll_and_yaw(side))]) for side in ("left", "right"))
     return jnp.exp(-100.0 * jnp.clip(legs - 0.1, 0.0, 50.0)) - 0.01 * norm(q)
 
 

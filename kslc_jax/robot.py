@@ -1,6 +1,6 @@
-"""The robot: loads our MJCF of XBot-L and reads static facts from the compiled model.
+"""A robot: compiles its model and reads static facts from it.
 
-One file gives two models:
+One description gives two models:
 
 - "train": 5 ms steps. The soles touch the floor. Capsules keep the limbs and the trunk apart.
 - "high", for evaluation: 1 ms steps, elliptic cones, a converged solver, collision of all parts,
@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from kslc_jax import robots
 from kslc_jax.config import Fidelity
+from kslc_jax.robots import anatomy, description
+from kslc_jax.robots.anatomy import Anatomy
 
-MODEL_PATH = robots.XBOT_L
+XBOT_L = "xbot_l"
+"""The robot of the paper. Presets are made for it; `mass_ratio` and `length_ratio` refer to it."""
 
 _FLOOR_BIT, _PART_BIT = 1, 2
 _DECOR_GROUP = 1
@@ -39,28 +41,54 @@ All 9 contacts with friction fit: 8 sole spheres on the floor, and 1 pair of fee
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """Static facts of the robot, read from the compiled model. [16] is in action order."""
+    """Static facts of a robot, read from the compiled model. [n] is in action order."""
 
     mj_model: mujoco.MjModel
     name: str
-    joint_names: tuple[str, ...]  # 16
-    kp: np.ndarray  # [16] N m/rad
-    kd: np.ndarray  # [16] N m s/rad
-    effort_limit: np.ndarray  # [16] N m
-    speed_limit: np.ndarray  # [16] rad/s
-    joint_inertia: np.ndarray  # [16] kg m^2, 1 / diag(M^-1): home pose, no contact
-    joint_lower: np.ndarray  # [16] rad
-    joint_upper: np.ndarray  # [16] rad
-    default_qpos: np.ndarray  # [23] home keyframe
-    is_arm: np.ndarray  # [16] bool
-    base_body_id: int
-    link_body_ids: np.ndarray  # [17] the base, then the link after each joint
-    hand_body_ids: np.ndarray  # [2] last link of each arm
+    joint_names: tuple[str, ...]  # n
+    kp: np.ndarray  # [n] N m/rad
+    kd: np.ndarray  # [n] N m s/rad
+    effort_limit: np.ndarray  # [n] N m
+    speed_limit: np.ndarray  # [n] rad/s
+    joint_inertia: np.ndarray  # [n] kg m^2, 1 / diag(M^-1): home pose, no contact
+    joint_lower: np.ndarray  # [n] rad
+    joint_upper: np.ndarray  # [n] rad
+    default_qpos: np.ndarray  # [7 + n] home keyframe
+    anatomy: Anatomy
+    trunk_body_id: int  # heaviest body outside the limbs; carries the payload
+    link_body_ids: np.ndarray  # [1 + n] the base, then the link after each joint
+    hand_body_ids: np.ndarray  # [2] last link of each arm; [0] for a robot without arms
+    hand_points: np.ndarray  # [2, 3] m, centre of each hand, frame of its link
     subtree: np.ndarray  # [B, B] 1 if body `column` is in the subtree of body `row`
     foot_geom_ids: np.ndarray  # sole spheres; at high fidelity also the foot boxes
     torso_box_center: np.ndarray  # [3] m, base frame
     torso_box_half_size: np.ndarray  # [3] m
     total_mass: float  # kg
+    stand_height: float  # m, base above the soles at home
+    sole_drop: float  # m, frame of a foot above its sole
+    mass_ratio: float  # total mass by XBot-L's
+    length_ratio: float  # standing height by XBot-L's
+
+    @property
+    def count(self) -> int:
+        """Number n of joints."""
+        return len(self.joint_names)
+
+    @property
+    def is_arm(self) -> np.ndarray:
+        """[n] bool, True for joints of the arms."""
+        return self.anatomy.is_arm
+
+    @property
+    def reference_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limit [n] of the joint angles, measured from the home pose [rad]."""
+        home = self.default_qpos[7:]
+        return self.joint_lower - home, self.joint_upper - home
+
+    def roll_and_yaw(self, side: str) -> list[int]:
+        """Joints of the hip of one side that turn about x and z; a leg may lack one."""
+        names = f"{side}_hip_roll", f"{side}_hip_yaw"
+        return [self.anatomy.roles[name] for name in names if name in self.anatomy.roles]
 
     def sensor(self, name: str) -> slice:
         """Slice of the named sensor in `sensordata`. KeyError lists the known names."""
@@ -85,16 +113,22 @@ def load(
     timestep: float | None = None,
     iterations: int | None = None,
     ls_iterations: int | None = None,
+    name: str = XBOT_L,
 ) -> Robot:
-    """Compiles the robot's model and reads its facts (cached).
+    """Compiles a robot's model and reads its facts (cached).
 
     Args:
       fidelity: "train" or "high".
       timestep: physics step [s]. None: default of the fidelity.
       iterations: Newton iterations of the contact solver. None: default of the fidelity.
       ls_iterations: line-search iterations. None: default of the fidelity.
+      name: a shipped robot, or the path of a description.
+
+    Raises:
+      RobotError: no such robot, or one that cannot be used.
     """
-    spec = mujoco.MjSpec.from_file(str(MODEL_PATH))
+    described = description.read(name)
+    spec = mujoco.MjSpec.from_file(str(described.mjcf))
     if fidelity == "high":
         _raise_fidelity(spec)
     else:
@@ -113,9 +147,12 @@ def load(
     model.actuator_forcelimited[:] = 0
     joints = model.actuator_trnid[:, 0]
     names = tuple(model.joint(j).name for j in joints)
-    is_arm = np.array([name.split("_")[1] in ("shoulder", "elbow") for name in names])
-    base, links = model.body("base_link").id, model.jnt_bodyid[joints]
-    box = model.site("torso_box")
+    home = model.keyframe("home").qpos.copy()
+    parts, links = anatomy.study(model, home), model.jnt_bodyid[joints]
+    hands = [links[arm[-1]] for limb, arm in parts.limbs.items() if limb.endswith("arm")]
+    box, mass = model.site("torso_box"), float(model.body_subtreemass[0])
+    stand_height = described.stand_height or 0.0
+    xbot = load() if (name, fidelity) != (XBOT_L, "train") else None
     return Robot(
         mj_model=model,
         name=spec.modelname,
@@ -127,17 +164,32 @@ def load(
         joint_inertia=_joint_inertia(model),
         joint_lower=model.jnt_range[joints, 0],
         joint_upper=model.jnt_range[joints, 1],
-        default_qpos=model.keyframe("home").qpos.copy(),
-        is_arm=is_arm,
-        base_body_id=base,
-        link_body_ids=np.append(base, links),
-        hand_body_ids=np.setdiff1d(links[is_arm], model.body_parentid),
+        default_qpos=home,
+        anatomy=parts,
+        trunk_body_id=parts.trunk,
+        link_body_ids=np.append(parts.base, links),
+        hand_body_ids=np.array(hands, int),
+        hand_points=_hand_points(model, hands),
         subtree=_subtree(model),
         foot_geom_ids=np.flatnonzero(model.geom_priority > 0),
         torso_box_center=box.pos.copy(),
         torso_box_half_size=box.size.copy(),
-        total_mass=float(model.body_subtreemass[0]),
+        total_mass=mass,
+        stand_height=stand_height,
+        sole_drop=described.sole_drop or 0.0,
+        mass_ratio=mass / xbot.total_mass if xbot else 1.0,
+        length_ratio=stand_height / xbot.stand_height if xbot else 1.0,
     )
+
+
+def _hand_points(model: mujoco.MjModel, hands: list[int]) -> np.ndarray:
+    """[2, 3] centre of the geoms "left_hand" and "right_hand", else the link's centre of mass."""
+    points = np.reshape(model.body_ipos[hands], (-1, 3)).copy()
+    for i, side in enumerate(("left", "right")[: len(hands)]):
+        hand = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, f"{side}_hand")
+        if hand >= 0:
+            points[i] = model.geom_pos[hand]
+    return points
 
 
 def _subtree(model: mujoco.MjModel) -> np.ndarray:
@@ -149,7 +201,7 @@ def _subtree(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
-    """[16] kg m^2, 1 / diag(M^-1) at the home pose without contact.
+    """[n] kg m^2, 1 / diag(M^-1) at the home pose without contact.
 
     It is the torque on one joint over its acceleration, while all other joints and the base are
     free to move.
@@ -213,14 +265,3 @@ def _limb(body: mujoco.MjsBody) -> str:
     while body.parent.name != "world" and body.parent.parent.name != "world":
         body = body.parent
     return body.name
-
-
-def mirror_joints() -> tuple[np.ndarray, np.ndarray]:
-    """(permutation [16], sign [16]): q[permutation] * sign is the left-right mirrored joint vector.
-
-    This robot's joint axes are such that mirroring swaps the sides and negates every joint.
-    """
-    names = load().joint_names
-    swap = {"left": "right", "right": "left"}
-    partner = [swap[side] + "_" + rest for side, rest in (n.split("_", 1) for n in names)]
-    return np.array([names.index(p) for p in partner]), -np.ones(len(names), np.float32)

@@ -20,7 +20,7 @@ CONTACT_FORCE = 5.0
 class Signals:
     """Physical quantities of one environment at one instant. Feet and knees: left, right."""
 
-    joint_pos: jax.Array  # [16] rad
+    joint_pos: jax.Array  # [n] rad, from the home pose
     joint_vel: jax.Array  # [16] rad/s
     torque: jax.Array  # [16] N m
     base_pos: jax.Array  # [3] m, world
@@ -51,7 +51,7 @@ def read(robot: Robot, state: PhysicsState) -> Signals:
     foot_force = both("foot_touch")[:, 0]
     angvel = state.qvel[3:6]
     return Signals(
-        joint_pos=state.qpos[7:],
+        joint_pos=state.qpos[7:] - jnp.asarray(robot.default_qpos[7:], state.qpos.dtype),
         joint_vel=state.qvel[6:],
         torque=state.torque,
         base_pos=state.qpos[:3],

@@ -39,7 +39,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from kslc_jax import cli, evaluate, files
-from kslc_jax.config import ConfigError, HighFidelity, require_seed
+from kslc_jax.config import ConfigError, PhysicsConfig, require_seed
 from kslc_jax.errors import MissingPackage
 from kslc_jax.evaluation import tables
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
@@ -141,12 +141,12 @@ def simulator(engine: Engine):
     return drake.step
 
 
-def setting(args: Args, condition: str) -> "Setting":
+def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
     """The conditions of one sweep."""
     from kslc_jax.evaluation import trials
 
     plain = trials.Setting(
-        HighFidelity(),
+        physics,
         seconds=args.seconds,
         noise=args.noise,
         latency=args.latency,
@@ -184,10 +184,10 @@ def _rows(
     args: Args, policy: "Policy", condition: str, progress: Callable[[float], None]
 ) -> list[dict[str, Any]]:
     """The rows of one condition, with the reasons why they lie beyond the training."""
-    from kslc_jax.evaluation import scheduled, schedules, trained
+    from kslc_jax.evaluation import scheduled, schedules, trained, trials
     from kslc_jax.evaluation.measure import measure
 
-    conditions = setting(args, condition)
+    conditions = setting(args, trials.engine(policy, "high"), condition)
     if args.schedule:
         v_max = float(policy.curriculum.v_max)
         plans = [schedules.named(n, policy.config, v_max, args.top) for n in args.schedule]

@@ -13,16 +13,13 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import curriculum as curriculum_lib
-from kslc_jax import env, networks, observations, ppo
+from kslc_jax import env, networks, observations, physics, ppo
 from kslc_jax.config import Config, RunConfig
 from kslc_jax.curriculum import Curriculum, Progress
 from kslc_jax.env import EnvState, Outcome
 from kslc_jax.networks import Gaussian, Params
 from kslc_jax.ppo import Learner, RolloutConstants, Samples
 from kslc_jax.rollout import Trajectory, collect, finite, or_new_episode, windows
-
-_VELOCITY = observations.slices(observations.CRITIC)["base_linvel"]
-"""Slice of the base velocity, the estimator's target, in the critic's frame."""
 
 Metrics = dict[str, jax.Array]
 ShardIndex = Callable[[jax.Array], jax.Array]
@@ -170,6 +167,8 @@ def _observer(
     """
     actor = windows(start.history, traj.frame, traj.age)
     critic = windows(start.privileged_history, traj.privileged, traj.age)
+    table = observations.critic_table(physics.robot_for(config.physics))
+    velocity = observations.slices(table)["base_linvel"]
 
     def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array, jax.Array]:
         index = shard_index(index)
@@ -177,7 +176,7 @@ def _observer(
         seen = critic(index)
         error = jnp.zeros(index.shape)
         if estimate is not None:
-            error = jnp.sum(jnp.square(estimate - seen[:, -1, _VELOCITY]), axis=-1)
+            error = jnp.sum(jnp.square(estimate - seen[:, -1, velocity]), axis=-1)
         return dist, networks.value(config, params, seen), error
 
     return apply

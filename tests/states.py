@@ -6,9 +6,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from kslc_jax import observations, robot
 from kslc_jax.commands import Command
 from kslc_jax.gait import GaitState
 from kslc_jax.signals import Signals
+
+XBOT = robot.load()
+ACTOR, CRITIC = observations.actor_table(XBOT), observations.critic_table(XBOT)
+MIRROR = XBOT.anatomy.permutation, XBOT.anatomy.sign
+"""q[MIRROR[0]] * MIRROR[1] is the mirrored joint vector of XBot-L."""
 
 
 def _fill(cls: type, defaults: dict[str, Any], changes: dict[str, Any]) -> Any:

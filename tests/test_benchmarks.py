@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from states import ACTOR, XBOT
 
 from benchmarks import compile_time, gpu, memory, parts, purejaxrl, throughput, timeline, timing
 from kslc_jax import observations, physics, randomize, signals, train_step
@@ -113,7 +114,7 @@ def test_gym_environment_is_the_same_robot(debug):
     env.reset()
     sole = env.model.geom_friction[env.robot.foot_geom_ids[0], 0]
     ground = config.randomize.ground_friction
-    nominal = randomize.nominal(friction=2.0 * sole - ground)
+    nominal = randomize.nominal(XBOT, friction=2.0 * sole - ground)
     state = physics.initial_state(
         config.physics, jnp.asarray(env.data.qpos), jnp.asarray(env.data.qvel)
     )
@@ -137,12 +138,12 @@ def test_gym_environment_is_the_same_robot(debug):
         reference=env.reference,
         last_action=env.action,
         push=jnp.zeros(5),
-        base_mass=jnp.asarray(env.model.body_mass[env.robot.base_body_id]),
+        base_mass=jnp.asarray(env.model.body_mass[env.robot.anatomy.base]),
     )
     frames = env._observe()
-    actor = observations._frame(observations.ACTOR, sources)
+    actor = observations._frame(ACTOR, sources)
     np.testing.assert_allclose(frames["policy"][-1], actor, atol=1e-5)
-    critic = observations.critic_frame(config.env, sources)
+    critic = observations.critic_frame(config.env, XBOT, sources)
     np.testing.assert_allclose(frames["critic"][-1], critic, atol=1e-5)
 
 

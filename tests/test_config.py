@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 import pytest
+from states import XBOT
 
 from kslc_jax import config as config_lib
 from kslc_jax import observations, train
@@ -52,12 +53,12 @@ def test_table_1():
     assert PAPER.ppo.learning_rate == 1e-5
     assert PAPER.env.frames == 15
     assert PAPER.env.privileged_frames == 3
-    assert observations.ACTOR_WIDTH == 59
-    assert observations.CRITIC_WIDTH == 89
+    assert observations.actor_width(XBOT) == 59
+    assert observations.critic_width(XBOT) == 89
 
 
 def test_table_2_and_the_action_space():
-    assert config_lib.NUM_JOINTS == 16
+    assert XBOT.count == 16
     assert PAPER.env.arms == "free"
 
 

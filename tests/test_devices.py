@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from processes import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
+from states import XBOT
 
 from kslc_jax import checkpoint_format, env, observations, physics, train, train_step
-from kslc_jax.config import NUM_JOINTS, ConfigError, preset
+from kslc_jax.config import ConfigError, preset
 from kslc_jax.training import checkpoint, devices
 
 STEPS = 3
@@ -178,8 +179,9 @@ def test_devices_tell_what_the_documentation_counts(glided):
     n, t = MJX.env.num_envs, MJX.ppo.rollout_steps
     actor, critic = t + MJX.env.frames - 1, t + MJX.env.privileged_frames - 1
     floats = {
-        "frames": n * (actor * observations.ACTOR_WIDTH + critic * observations.CRITIC_WIDTH),
-        "action and mean": 2 * n * t * NUM_JOINTS,
+        "frames": n
+        * (actor * observations.actor_width(XBOT) + critic * observations.critic_width(XBOT)),
+        "action and mean": 2 * n * t * XBOT.count,
         "log_prob, value, advantage, target, age, valid": 6 * n * t,
     }
     assert set(told) == {"all-gather", "all-reduce"}

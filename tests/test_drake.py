@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from states import XBOT
 
 from kslc_jax import curriculum, networks, physics, randomize
 from kslc_jax import policy as policy_lib
@@ -16,7 +17,7 @@ pytest.importorskip("pydrake", reason="Drake is an optional extra")
 from kslc_jax.evaluation import drake
 
 CONFIG = HighFidelity()
-NOMINAL = jax.tree.map(np.asarray, randomize.nominal())
+NOMINAL = jax.tree.map(np.asarray, randomize.nominal(XBOT))
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +122,7 @@ def test_low_friction_slides(world):
     state = rest(qpos, np.r_[0.0, 0.3, np.zeros(20)])
     slid = {}
     for mu in (0.05, 1.0):
-        fields = randomize.model_fields(world.robot, randomize.nominal(mu), mu)
+        fields = randomize.model_fields(world.robot, randomize.nominal(XBOT, mu), mu)
         fields = jax.tree.map(lambda x: np.asarray(x, np.float64), fields)
         for engine, step in (("drake", drake._host_step), ("mujoco", physics._host_step)):
             now = state
@@ -142,10 +143,10 @@ def test_step_is_physics_step(world):
         jax.vmap(lambda s, d: drake.step(CONFIG, s, jnp.zeros(16), d, 1.0), in_axes=(None, 0))
     )
     start = physics.initial_state(CONFIG, jnp.asarray(world.robot.default_qpos), jnp.zeros(22))
-    heavy = randomize.nominal().replace(base_mass=jnp.array(5.0))
-    both = step(start, jax.tree.map(lambda *x: jnp.stack(x), randomize.nominal(), heavy))
+    heavy = randomize.nominal(XBOT).replace(base_mass=jnp.array(5.0))
+    both = step(start, jax.tree.map(lambda *x: jnp.stack(x), randomize.nominal(XBOT), heavy))
     assert jax.tree.map(lambda x: x.shape[1:], both) == jax.tree.map(jnp.shape, start)
-    for i, dynamics in enumerate((randomize.nominal(), heavy)):
+    for i, dynamics in enumerate((randomize.nominal(XBOT), heavy)):
         fields = randomize.model_fields(world.robot, dynamics, 1.0)
         one = drake._host_step(CONFIG, start, np.zeros(16), dynamics, fields)
         for a, b in zip(jax.tree.leaves(both), jax.tree.leaves(one), strict=True):

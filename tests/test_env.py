@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from states import ACTOR, CRITIC
 
 from kslc_jax import commands, curriculum, env, observations, physics, signals
 from kslc_jax.config import preset
@@ -214,12 +215,12 @@ def test_frames_hold_what_the_state_holds(setting):
     """Some components of the actor and critic frames after a reset equal the state."""
     _config, reset, _ = setting
     state = reset(jax.random.key(5))
-    actor = {n: state.history[-1][s] for n, s in observations.slices(observations.ACTOR).items()}
+    actor = {n: state.history[-1][s] for n, s in observations.slices(ACTOR).items()}
     np.testing.assert_allclose(actor["joint_pos"], state.physics.qpos[7:], atol=1e-6)
     np.testing.assert_allclose(
         actor["command"], state.command.velocity * jnp.array([2.0, 2.0, 1.0]), atol=1e-6
     )
-    at = observations.slices(observations.CRITIC)
+    at = observations.slices(CRITIC)
     critic = {n: state.privileged_history[-1][s] for n, s in at.items()}
     np.testing.assert_allclose(critic["friction"][0], state.dynamics.friction, rtol=1e-6)
     mass = 21.081917 + state.dynamics.base_mass
@@ -282,7 +283,7 @@ def test_a_step_pushes_and_the_critic_sees_it(debug):
     push, seen = np.asarray(new.push), np.asarray(new.privileged_history[:, -1])
     np.testing.assert_allclose(np.abs(push).max(0), [0.2, 0.2, 0.4, 0.4, 0.4], rtol=0.05)
     assert np.all(np.abs(push.mean(0)) < 0.06)
-    at = observations.slices(observations.CRITIC)
+    at = observations.slices(CRITIC)
     np.testing.assert_allclose(seen[:, at["push_linear"]], push[:, :2], atol=1e-6)
     np.testing.assert_allclose(seen[:, at["base_angvel"]], new.physics.qvel[:, 3:6], atol=1e-6)
 

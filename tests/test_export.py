@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import onnx
 import pytest
+from states import ACTOR, MIRROR, XBOT
 
 from kslc_jax import (
     checkpoint_format,
@@ -31,6 +32,7 @@ from kslc_jax import (
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import trials
+from kslc_jax.robots import description
 
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
@@ -91,7 +93,7 @@ def runner():
 
 
 def histories(policy, batch=5):
-    shape = batch, policy.config.env.frames, observations.ACTOR_WIDTH
+    shape = batch, policy.config.env.frames, observations.actor_width(XBOT)
     return np.asarray(jax.random.normal(jax.random.key(1), shape))
 
 
@@ -116,8 +118,8 @@ def test_the_symmetric_actor_as_a_plain_mlp_mirrors(symmetric, tmp_path):
     path = tmp_path / "policy.onnx"
     path.write_bytes(export.to_onnx(symmetric))
     network = export.read_onnx(path)
-    permutation, sign = observations.mirror_map(observations.ACTOR)
-    joints, joint_sign = robot.mirror_joints()
+    permutation, sign = observations.mirror_map(ACTOR, XBOT)
+    joints, joint_sign = MIRROR
     seen = histories(symmetric)
     mirrored = (seen[..., permutation] * sign).astype(np.float32)
     np.testing.assert_allclose(network(mirrored), network(seen)[:, joints] * joint_sign, atol=2e-6)
@@ -146,7 +148,7 @@ def test_metadata(symmetric, xbot):
     assert data["default_joint_pos"] == [0] * 16 and data["control_dt"] == 0.01
     assert data["action_scale"] == 0.25 and data["action_clip"] == 18
     assert data["history_length"] == 3 and data["observation_clip"] == 18
-    assert sum(c["width"] for c in data["frame"]) == observations.ACTOR_WIDTH
+    assert sum(c["width"] for c in data["frame"]) == observations.actor_width(XBOT)
     assert data["frame"][1] == {"name": "command", "width": 3, "scale": (2, 2, 1)}
     assert data["gait"] == {
         "cycle_time": pytest.approx(CYCLE),
@@ -328,7 +330,7 @@ def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
 
 
 def test_the_runner_refuses_a_timestep_that_does_not_fill_the_control_step(runner, onnx_file):
-    model = mujoco.MjModel.from_xml_path(str(robot.MODEL_PATH))
+    model = mujoco.MjModel.from_xml_path(str(description.read(robot.XBOT_L).mjcf))
     controller = runner.Controller(onnx_file, 0.0)
     for timestep in (0.003, 0.004, 0.0015, 0.02):
         model.opt.timestep = timestep
@@ -362,7 +364,7 @@ def test_motor_torque_is_the_packages(runner, symmetric, xbot):
     rng = np.random.default_rng(0)
     q, target = rng.uniform(-1, 1, (2, 200, 16))
     dq = rng.uniform(-20, 20, (200, 16))
-    one = jax.tree.map(np.asarray, randomize.nominal())
+    one = jax.tree.map(np.asarray, randomize.nominal(XBOT))
     meta = runner.SimpleNamespace(**export.metadata(symmetric))
     np.testing.assert_allclose(
         runner.motor_torque(meta, target, q, dq),

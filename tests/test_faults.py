@@ -42,6 +42,7 @@ from kslc_jax import (
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import preset, to_dict
+from kslc_jax.robots import description
 from kslc_jax.training import recovery, run_folder
 from kslc_jax.training.checkpoint import Store
 from kslc_jax.training.logs import MetricsFile
@@ -775,11 +776,12 @@ def edit_robot(tmp_path, monkeypatch):
     """Changes the robot's MJCF, for this process, from one text to another."""
 
     def edit(old: str, new: str) -> None:
-        text = robot.MODEL_PATH.read_text()
+        text = description.read(robot.XBOT_L).mjcf.read_text()
         assert old in text
         path = tmp_path / "robot.xml"
         path.write_text(text.replace(old, new, 1))
-        monkeypatch.setattr(robot, "MODEL_PATH", path)
+        described = dataclasses.replace(description.read(robot.XBOT_L), mjcf=path)
+        monkeypatch.setattr(description, "read", lambda name: described)
         monkeypatch.setattr(robot, "load", functools.lru_cache(robot.load.__wrapped__))
 
     return edit
@@ -808,10 +810,10 @@ class TestChangedRobot:
     @pytest.mark.parametrize("old", CHANGES)
     def test_every_kind_of_change_is_named(self, edit_robot, old):
         new, said = CHANGES[old]
-        before = fingerprint.fingerprint()
+        before = fingerprint.fingerprint(robot.XBOT_L)
         assert fingerprint.changes(before, before) == ""
         edit_robot(old, new)
-        found = fingerprint.changes(before, fingerprint.fingerprint())
+        found = fingerprint.changes(before, fingerprint.fingerprint(robot.XBOT_L))
         assert found.startswith(said) and len(found) < 200
 
     def test_resume_and_policy_say_so(self, saved, restored, tmp_path, edit_robot):
@@ -854,12 +856,13 @@ class TestChangedRobot:
 
     def test_both_fidelities_count(self, edit_robot):
         """Joint friction acts at high fidelity only."""
-        before = fingerprint.fingerprint()
+        before = fingerprint.fingerprint(robot.XBOT_L)
         text = re.search(
-            r'name="high_frictionloss"[^>]*data="([\d.]+)', robot.MODEL_PATH.read_text()
+            r'name="high_frictionloss"[^>]*data="([\d.]+)',
+            description.read(robot.XBOT_L).mjcf.read_text(),
         )
         edit_robot(text[0], text[0][: -len(text[1])] + "0.123")
-        said = fingerprint.changes(before, fingerprint.fingerprint())
+        said = fingerprint.changes(before, fingerprint.fingerprint(robot.XBOT_L))
         assert said == "joint friction and damping at high fidelity"
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from states import joints, make_command, make_gait, make_signals
+from states import MIRROR, joints, make_command, make_gait, make_signals
 
 from kslc_jax import curriculum, gait, robot
 from kslc_jax.config import GaitConfig, preset
@@ -261,7 +261,7 @@ def test_reference_pose_of_standing_still_is_zero():
 
 @pytest.mark.parametrize("phase", [0.05, 0.2, 0.3, 0.45])
 def test_half_a_cycle_later_the_reference_is_mirrored(phase):
-    permutation, sign = robot.mirror_joints()
+    permutation, sign = MIRROR
     np.testing.assert_allclose(
         pose(phase + 0.5, 3.0, SWEEPING), pose(phase, 3.0, SWEEPING)[permutation] * sign, atol=1e-6
     )

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from states import ACTOR, CRITIC, MIRROR, XBOT
 
-from kslc_jax import networks, observations, robot
+from kslc_jax import networks, observations
 from kslc_jax.config import ConfigError, NetworkConfig, preset
 
 CONFIG = preset("debug")
@@ -25,16 +26,16 @@ def perturbed(config):
 
 
 def mirrored(table, frames):
-    permutation, sign = observations.mirror_map(table)
+    permutation, sign = observations.mirror_map(table, XBOT)
     return frames[..., permutation] * sign
 
 
 @pytest.mark.parametrize(
     "mirror",
     [
-        observations.mirror_map(observations.ACTOR),
-        observations.mirror_map(observations.CRITIC),
-        robot.mirror_joints(),
+        observations.mirror_map(ACTOR, XBOT),
+        observations.mirror_map(CRITIC, XBOT),
+        MIRROR,
         (np.array([2, 1, 0, 3]), np.array([1.0, 1.0, 1.0, -1.0])),
     ],
 )
@@ -49,19 +50,21 @@ def test_parity_splits_every_vector(mirror):
 
 def test_value_of_a_mirrored_robot_is_the_same():
     params = perturbed(CONFIG)
-    frames = jax.random.normal(KEY, (5, CONFIG.env.privileged_frames, observations.CRITIC_WIDTH))
+    frames = jax.random.normal(
+        KEY, (5, CONFIG.env.privileged_frames, observations.critic_width(XBOT))
+    )
     here = networks.value(CONFIG, params, frames)
-    there = networks.value(CONFIG, params, mirrored(observations.CRITIC, frames))
+    there = networks.value(CONFIG, params, mirrored(CRITIC, frames))
     np.testing.assert_allclose(here, there, rtol=1e-4, atol=1e-5)
     assert np.std(here) > 0.1
 
 
 def test_action_of_a_mirrored_robot_is_mirrored_for_any_weights():
     params = perturbed(CONFIG)
-    history = jax.random.normal(KEY, (5, CONFIG.env.frames, observations.ACTOR_WIDTH))
+    history = jax.random.normal(KEY, (5, CONFIG.env.frames, observations.actor_width(XBOT)))
     here = networks.policy(CONFIG, params, history).mean
-    there = networks.policy(CONFIG, params, mirrored(observations.ACTOR, history)).mean
-    joints, sign = robot.mirror_joints()
+    there = networks.policy(CONFIG, params, mirrored(ACTOR, history)).mean
+    joints, sign = MIRROR
     np.testing.assert_allclose(there, here[:, joints] * sign, rtol=1e-4, atol=1e-5)
     assert np.std(here) > 0.1
 
@@ -77,7 +80,7 @@ def test_symmetric_networks_have_half_the_weights():
 
 @pytest.mark.parametrize("symmetric", [False, True])
 def test_init_mean_scales_the_first_actions(symmetric):
-    history = jax.random.normal(KEY, (64, CONFIG.env.frames, observations.ACTOR_WIDTH))
+    history = jax.random.normal(KEY, (64, CONFIG.env.frames, observations.actor_width(XBOT)))
 
     def size(init_mean):
         network = dataclasses.replace(CONFIG.network, symmetric=symmetric, init_mean=init_mean)
@@ -106,9 +109,9 @@ def test_the_estimate_mirrors_and_only_its_own_error_trains_it():
     """In the mirror vy changes its sign. The actor reads the estimate, but the actor's gradient
     does not reach the estimator."""
     params = perturbed(CONFIG)
-    history = jax.random.normal(KEY, (CONFIG.env.frames, observations.ACTOR_WIDTH))
+    history = jax.random.normal(KEY, (CONFIG.env.frames, observations.actor_width(XBOT)))
     here = networks.policy_and_estimate(CONFIG, params, history)[1]
-    there = networks.policy_and_estimate(CONFIG, params, mirrored(observations.ACTOR, history))[1]
+    there = networks.policy_and_estimate(CONFIG, params, mirrored(ACTOR, history))[1]
     np.testing.assert_allclose(there, here * np.array([1.0, -1.0, 1.0]), atol=1e-6)
     assert np.abs(here).min() > 1e-3
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from states import make_command, make_gait, make_signals
+from states import ACTOR, CRITIC, MIRROR, XBOT, make_command, make_gait, make_signals
 
-from kslc_jax import gait, observations, randomize, robot, signals
+from kslc_jax import gait, observations, randomize, signals
 from kslc_jax.config import EnvConfig, PhysicsConfig, preset
-from kslc_jax.observations import ACTOR, CRITIC
 from kslc_jax.physics import PhysicsState, initial_state
 
 KEY = jax.random.key(0)
@@ -36,7 +35,7 @@ def make_sources(**changes) -> observations.Sources:
         ),
         gait=make_gait(clock=[0.6, 0.8], stance=[False, True]),
         command=make_command(velocity=[2.0, -0.3, 0.7]),
-        dynamics=randomize.nominal(friction=1.3),
+        dynamics=randomize.nominal(XBOT, friction=1.3),
         reference=jnp.asarray(REFERENCE, jnp.float32),
         last_action=jnp.asarray(ACTION, jnp.float32),
         push=jnp.array([0.11, -0.12, 0.21, -0.22, 0.23]),
@@ -49,7 +48,7 @@ def make_sources(**changes) -> observations.Sources:
 
 
 def test_widths():
-    assert observations.ACTOR_WIDTH == 59 and observations.CRITIC_WIDTH == 89
+    assert observations.actor_width(XBOT) == 59 and observations.critic_width(XBOT) == 89
     assert observations.width(ACTOR) == 59 and observations.width(CRITIC) == 89
 
 
@@ -146,8 +145,8 @@ CRITIC_FRAME = np.concatenate(
 
 @pytest.mark.parametrize("jit", [False, True])
 def test_frames_by_hand(jit):
-    actor = lambda src: observations.actor_frame(QUIET, src, KEY)  # noqa: E731
-    critic = lambda src: observations.critic_frame(EnvConfig(), src)  # noqa: E731
+    actor = lambda src: observations.actor_frame(QUIET, XBOT, src, KEY)  # noqa: E731
+    critic = lambda src: observations.critic_frame(EnvConfig(), XBOT, src)  # noqa: E731
     actor, critic = (jax.jit(f) if jit else f for f in (actor, critic))
     np.testing.assert_allclose(actor(make_sources()), ACTOR_FRAME, atol=1e-6)
     np.testing.assert_allclose(critic(make_sources()), CRITIC_FRAME, atol=1e-6)
@@ -158,11 +157,11 @@ def test_frames_are_clipped_at_18():
         signals=make_signals(joint_vel=np.full(16, 500.0), joint_pos=np.full(16, -30.0)),
         last_action=jnp.full(16, 17.5),
     )
-    frame = observations.actor_frame(EnvConfig(), src, KEY)
+    frame = observations.actor_frame(EnvConfig(), XBOT, src, KEY)
     np.testing.assert_array_equal(frame[21:37], np.full(16, 18.0))
     np.testing.assert_array_equal(frame[5:21], np.full(16, -18.0))
     np.testing.assert_array_equal(frame[37:53], np.full(16, 17.5))
-    critic = observations.critic_frame(EnvConfig(observation_clip=3.0), src)
+    critic = observations.critic_frame(EnvConfig(observation_clip=3.0), XBOT, src)
     assert float(jnp.max(jnp.abs(critic))) == 3.0
 
 
@@ -176,7 +175,7 @@ NOISE = np.concatenate(
 def noisy():
     """Deviations of 4000 noisy frames from the clean frame: [4000, 59], at noise level 0.6."""
     frame = jax.jit(
-        jax.vmap(lambda key: observations.actor_frame(EnvConfig(), make_sources(), key))
+        jax.vmap(lambda key: observations.actor_frame(EnvConfig(), XBOT, make_sources(), key))
     )
     return np.asarray(frame(jax.random.split(KEY, 4000))) - ACTOR_FRAME
 
@@ -197,7 +196,8 @@ def test_noise_is_gaussian_and_independent(noisy):
 def test_noise_level_scales_all_of_it():
     key = jax.random.key(1)
     one, two = (
-        observations.actor_frame(EnvConfig(noise_level=level), make_sources(), key) - ACTOR_FRAME
+        observations.actor_frame(EnvConfig(noise_level=level), XBOT, make_sources(), key)
+        - ACTOR_FRAME
         for level in (0.5, 1.0)
     )
     np.testing.assert_allclose(two, 2 * one, atol=2e-6)
@@ -205,14 +205,14 @@ def test_noise_level_scales_all_of_it():
 
 
 def test_noise_factor_of_the_episode_scales_it_too():
-    key, dynamics = jax.random.key(1), randomize.nominal(friction=1.3)
+    key, dynamics = jax.random.key(1), randomize.nominal(XBOT, friction=1.3)
     none, half = (
         observations.actor_frame(
-            EnvConfig(noise_level=1.0), make_sources(dynamics=dynamics.replace(noise=x)), key
+            EnvConfig(noise_level=1.0), XBOT, make_sources(dynamics=dynamics.replace(noise=x)), key
         )
         for x in (0.0, 0.5)
     )
-    level = observations.actor_frame(EnvConfig(noise_level=0.5), make_sources(), key)
+    level = observations.actor_frame(EnvConfig(noise_level=0.5), XBOT, make_sources(), key)
     np.testing.assert_array_equal(half, level)
     np.testing.assert_allclose(none, ACTOR_FRAME, atol=1e-6)
 
@@ -245,7 +245,7 @@ def mirrored(x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("table", [ACTOR, CRITIC], ids=["actor", "critic"])
 def test_mirroring_twice_changes_nothing(table):
-    permutation, sign = observations.mirror_map(table)
+    permutation, sign = observations.mirror_map(table, XBOT)
     n = observations.width(table)
     assert sorted(permutation) == list(range(n))
     assert set(sign.tolist()) == {-1.0, 1.0}
@@ -256,7 +256,7 @@ def test_mirroring_twice_changes_nothing(table):
 @settings(max_examples=20, deadline=None, derandomize=True, database=None)
 @given(st.lists(st.floats(-18, 18, width=32), min_size=59, max_size=59))
 def test_mirror_is_an_involution_on_any_frame(values):
-    permutation, sign = observations.mirror_map(ACTOR)
+    permutation, sign = observations.mirror_map(ACTOR, XBOT)
     x = np.asarray(values, np.float32)
     np.testing.assert_array_equal((x[permutation] * sign)[permutation] * sign, x)
 
@@ -282,8 +282,8 @@ def mirrored_sources() -> observations.Sources:
 
 def frames(src: observations.Sources):
     return (
-        (ACTOR, observations.actor_frame(QUIET, src, KEY)),
-        (CRITIC, observations.critic_frame(QUIET, src)),
+        (ACTOR, observations.actor_frame(QUIET, XBOT, src, KEY)),
+        (CRITIC, observations.critic_frame(QUIET, XBOT, src)),
     )
 
 
@@ -291,7 +291,7 @@ def test_frame_of_the_mirrored_state_is_the_mirrored_frame():
     for (table, here), (_, there) in zip(
         frames(make_sources()), frames(mirrored_sources()), strict=True
     ):
-        permutation, sign = observations.mirror_map(table)
+        permutation, sign = observations.mirror_map(table, XBOT)
         np.testing.assert_allclose(here[permutation] * sign, there, atol=1e-6)
         assert float(jnp.max(jnp.abs(here - there))) > 1.0
 
@@ -352,12 +352,12 @@ def test_mirrored_physics_gives_the_mirrored_frame(xbot):
         [0.1, -0.2, -0.3, 0.4, -0.5],
     )
     for (table, a), (_, b) in zip(frames(one), frames(two), strict=True):
-        permutation, sign = observations.mirror_map(table)
+        permutation, sign = observations.mirror_map(table, XBOT)
         np.testing.assert_allclose(a[permutation] * sign, b, atol=1e-5)
 
 
 def test_mirror_of_the_joints_is_the_robots():
-    permutation, sign = robot.mirror_joints()
+    permutation, sign = MIRROR
     assert permutation.tolist() == PARTNER and sign.tolist() == [-1.0] * 16
 
 

@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from states import XBOT
 
 from kslc_jax import maths, motors, physics, randomize, robot
 from kslc_jax.config import HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.robots import description
 
 ENGINES = ("mjx", "mujoco")
 GROUND = 0.6
@@ -32,7 +34,7 @@ class TestMotorTorque:
     KNEE = 3
 
     def torque(self, q=0.0, dq=0.0, target=0.0, **factors):
-        dyn = randomize.nominal().replace(**factors)
+        dyn = randomize.nominal(XBOT).replace(**factors)
         return motors.motor_torque(
             robot.load(),
             dyn,
@@ -72,7 +74,7 @@ class TestMotorTorque:
     def test_numpy_and_jax_agree(self):
         rng = np.random.default_rng(0)
         q, dq, target = rng.normal(size=(3, 16)) * 4
-        dyn = randomize.nominal()
+        dyn = randomize.nominal(XBOT)
         a = motors.motor_torque(robot.load(), dyn, q, dq, target)
         b = motors.motor_torque(robot.load(), jax.tree.map(np.asarray, dyn), q, dq, target, np)
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
@@ -86,8 +88,8 @@ class TestMotorDamping:
         """The damping is 0.6 kd where no limit changes the PD torque at both ends of the step."""
         rng = np.random.default_rng(3)
         q, dq, target = rng.normal(size=(3, 16)) * [[0.05], [0.5], [0.05]]
-        torque = motors.motor_torque(xbot, randomize.nominal(), q, dq, target, np)
-        damping = motors.motor_damping(xbot, randomize.nominal(), q, dq, target, torque, np)
+        torque = motors.motor_torque(xbot, randomize.nominal(XBOT), q, dq, target, np)
+        damping = motors.motor_damping(xbot, randomize.nominal(XBOT), q, dq, target, torque, np)
         np.testing.assert_allclose(damping, 0.6 * xbot.kd, rtol=1e-5)
 
     @pytest.mark.parametrize("dq", [-18.0, -4.0, 0.0, 8.0, 11.0, 18.0])
@@ -95,7 +97,7 @@ class TestMotorDamping:
     def test_a_joint_alone_moves_by_the_theta_method(self, xbot, dq, target):
         """The speed after a step with this damping solves the theta-method's equation
         M dv = h (0.4 torque(dq) + 0.6 torque(dq + dv)). Bisection finds its solution."""
-        dyn, h = randomize.nominal(), xbot.mj_model.opt.timestep
+        dyn, h = randomize.nominal(XBOT), xbot.mj_model.opt.timestep
         q, dq, target = np.zeros(16), np.full(16, dq), np.full(16, target)
 
         def torque(speed):
@@ -156,7 +158,7 @@ def test_no_motor_drives_a_joint_past_its_speed_limit(config):
         target = jnp.zeros(16).at[jnp.array(joints)].set(jnp.array([-there, there]))
         fastest = 0.0
         for _ in range(30):
-            state = step(state, target, randomize.nominal())
+            state = step(state, target, randomize.nominal(XBOT))
             fastest = max(fastest, float(jnp.abs(state.qvel[6 + jnp.array(joints)]).max()))
         assert 0.75 * limit < fastest <= 1.01 * limit
 
@@ -175,7 +177,7 @@ def test_braking_brings_a_joint_back_to_its_limit(config):
     before = momentum(robot, state)
     target = jnp.zeros(16).at[jnp.array([3, 9])].set(jnp.array([-4.0, 4.0]))
     for _ in range(2):
-        state = step(state, target, randomize.nominal())
+        state = step(state, target, randomize.nominal(XBOT))
     assert np.abs(state.qvel[jnp.array([9, 15])]).max() < 12.4
     pulled = before - [0.0, 0.0, 0.02 * 9.81 * robot.total_mass]
     np.testing.assert_allclose(momentum(robot, state), pulled, atol=1.0)
@@ -196,7 +198,7 @@ def runs():
     randomised dynamics."""
     config = RandomizeConfig(kp=(0.9, 1.1), kd=(0.9, 1.1), base_com=(-0.02, 0.02))
     keys = jax.random.split(jax.random.key(0), 8)
-    dyn = jax.vmap(randomize.sample, (None, 0))(config, keys)
+    dyn = jax.vmap(lambda key: randomize.sample(config, XBOT, key))(keys)
     out = {}
     for engine in ENGINES:
         c = PhysicsConfig(engine=engine, iterations=10, ls_iterations=10)
@@ -242,7 +244,7 @@ def test_legs_do_not_pass_through_each_other(engine):
     step = make_step(engine)
     closed = jnp.zeros(16).at[jnp.array([0, 6])].set(jnp.array([-0.3, 0.3]))
     for _ in range(40):
-        state = step(state, closed, randomize.nominal())
+        state = step(state, closed, randomize.nominal(XBOT))
     feet = [state.sensordata[robot.load().sensor(f"{s}_foot_pos")] for s in ("left", "right")]
     across = maths.quat_rotate_inverse(state.qpos[3:7], feet[0] - feet[1])[1]
     assert 0.08 < across < 0.13
@@ -250,7 +252,7 @@ def test_legs_do_not_pass_through_each_other(engine):
 
 def test_threads_do_not_change_results():
     config = PhysicsConfig(engine="mujoco")
-    dyn = jax.tree.map(lambda x: jnp.tile(x, (4,) + (1,) * x.ndim), randomize.nominal())
+    dyn = jax.tree.map(lambda x: jnp.tile(x, (4,) + (1,) * x.ndim), randomize.nominal(XBOT))
     states = []
     for threads in (1, 2):
         c = dataclasses.replace(config, threads=threads)
@@ -269,7 +271,7 @@ def test_a_batch_is_its_members():
     single = make_step("mujoco")
     batched = jax.jit(jax.vmap(lambda s, t, d: physics.step(config, s, t, d, GROUND)))
     keys = jax.random.split(jax.random.key(1), 3)
-    dyn = jax.vmap(randomize.sample, (None, 0))(RandomizeConfig(), keys)
+    dyn = jax.vmap(lambda key: randomize.sample(RandomizeConfig(), XBOT, key))(keys)
     state = jax.vmap(lambda _: standing(config))(jnp.arange(3))
     target = 0.1 * jax.random.normal(jax.random.key(2), (3, 16))
     many = batched(state, target, dyn)
@@ -284,7 +286,7 @@ def test_a_batch_is_its_members():
 
 def test_friction_is_the_mean_of_foot_and_ground(xbot):
     """(0.4 + 0.6) / 2 = 0.5. The model file has 1."""
-    fields = randomize.model_fields(xbot, randomize.nominal(0.4), GROUND)
+    fields = randomize.model_fields(xbot, randomize.nominal(XBOT, 0.4), GROUND)
     np.testing.assert_allclose(fields["geom_friction"][xbot.foot_geom_ids, 0], 0.5)
 
 
@@ -293,7 +295,7 @@ def test_added_mass_weighs(xbot):
     step = make_step("mujoco")
     force = []
     for extra in (0.0, 5.0):
-        dyn = randomize.nominal().replace(base_mass=jnp.asarray(extra))
+        dyn = randomize.nominal(XBOT).replace(base_mass=jnp.asarray(extra))
         state = standing(PhysicsConfig(engine="mujoco"))
         total = []
         for i in range(60):
@@ -309,10 +311,12 @@ def test_mass_randomisation_matches_a_recompiled_model(xbot):
     needs the subtree masses."""
     fields = randomize.model_fields(
         xbot,
-        randomize.nominal().replace(base_mass=jnp.asarray(4.0), base_com=jnp.array([0.05, 0, 0])),
+        randomize.nominal(XBOT).replace(
+            base_mass=jnp.asarray(4.0), base_com=jnp.array([0.05, 0, 0])
+        ),
         GROUND,
     )
-    spec = mujoco.MjSpec.from_file(str(robot.MODEL_PATH))
+    spec = mujoco.MjSpec.from_file(str(description.read(robot.XBOT_L).mjcf))
     base = spec.body("base_link")
     base.ipos = base.ipos + np.array([0.05, 0, 0])
     base.mass += 4.0
@@ -329,11 +333,11 @@ def test_link_randomisation_matches_a_recompiled_model(xbot):
     """Each link has its own mass factor and CoM shift, and the hands carry a load."""
     rng = np.random.default_rng(3)
     factor, shift = rng.uniform(0.9, 1.1, 17), rng.uniform(-0.01, 0.01, (17, 3))
-    changed = randomize.nominal().replace(
+    changed = randomize.nominal(XBOT).replace(
         link_mass=jnp.asarray(factor), link_com=jnp.asarray(shift), hand_mass=jnp.asarray(0.5)
     )
     fields = randomize.model_fields(xbot, changed, GROUND)
-    spec = mujoco.MjSpec.from_file(str(robot.MODEL_PATH))
+    spec = mujoco.MjSpec.from_file(str(description.read(robot.XBOT_L).mjcf))
     names = ["base_link", *(n.replace("joint", "link") for n in xbot.joint_names)]
     for name, f, s in zip(names, factor, shift, strict=True):
         body = spec.body(name)
@@ -352,7 +356,7 @@ def test_divergence_shows_as_nan_not_as_a_reset():
     step = make_step("mujoco")
     state = standing(PhysicsConfig(engine="mujoco"))
     state = state.replace(qvel=state.qvel.at[3].set(jnp.nan))
-    assert not np.all(np.isfinite(step(state, jnp.zeros(16), randomize.nominal()).qpos))
+    assert not np.all(np.isfinite(step(state, jnp.zeros(16), randomize.nominal(XBOT)).qpos))
 
 
 def test_sensors_are_those_of_the_new_state(xbot):
@@ -360,7 +364,7 @@ def test_sensors_are_those_of_the_new_state(xbot):
     step, state = make_step("mujoco"), standing(PhysicsConfig(engine="mujoco"))
     for i in range(10):
         target = 0.05 * jnp.sin(2 * jnp.pi * 0.01 * i + jnp.arange(16.0))
-        state = step(state, target, randomize.nominal())
+        state = step(state, target, randomize.nominal(XBOT))
     data = mujoco.MjData(xbot.mj_model)
     data.qpos[:], data.qvel[:] = state.qpos, state.qvel
     mujoco.mj_forward(xbot.mj_model, data)
@@ -374,7 +378,7 @@ def test_every_range_is_filled_independently():
         **{"joint_friction": (0.0, 1.0), "noise": (0.0, 0.5), "hand_mass": (0.0, 0.5)},
         **{"link_mass": (0.9, 1.1), "link_com": (-0.01, 0.01)},
     }
-    draw = jax.vmap(lambda key: randomize.sample(RandomizeConfig(**ranges), key))
+    draw = jax.vmap(lambda key: randomize.sample(RandomizeConfig(**ranges), XBOT, key))
     drawn, columns = draw(jax.random.split(jax.random.key(0), 2000)), []
     for name, (low, high) in ranges.items():
         columns.append(np.asarray(getattr(drawn, name)).reshape(2000, -1))
@@ -394,7 +398,10 @@ def test_a_program_that_enables_x64_can_step(engine, monkeypatch):
     try:
         state = standing(config)
         assert {str(x.dtype) for x in jax.tree.leaves(state)} == {"float32", "float64"}
-        step = lambda s, _: (physics.step(config, s, s.qpos[7:], randomize.nominal(), GROUND), None)  # noqa: E731
+
+        def step(s, _):
+            return physics.step(config, s, s.qpos[7:], randomize.nominal(XBOT), GROUND), None
+
         after = jax.eval_shape(lambda s: jax.lax.scan(step, s, None, 2)[0], state)
         assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, state)
         if engine == "mujoco":  # quickly compiled

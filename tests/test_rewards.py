@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from states import joints, make_command, make_gait, make_signals
+from states import CRITIC, MIRROR, joints, make_command, make_gait, make_signals
 
-from kslc_jax import observations, ppo, rewards, robot
+from kslc_jax import ppo, rewards, robot
 from kslc_jax.commands import Command
 from kslc_jax.config import PPOConfig, RewardConfig, RewardWeights, preset
 from kslc_jax.gait import GaitState
@@ -623,7 +623,7 @@ def test_equation_8_pays_both_sides_alike_only_as_read():
     sides differently: n = |0.3 e^4, 0.1 e^-2| = 16.4 on one side, |0.3 e^-4, 0.1 e^2| = 0.7389 on
     the other.
     """
-    permutation, sign = robot.mirror_joints()
+    permutation, sign = MIRROR
     q, dq = joints(left_knee=-0.3, left_leg_pitch=-0.1), joints(left_knee=-4.0, left_leg_pitch=2.0)
     there = q[permutation] * sign, dq[permutation] * sign
     assert literal_equation_8(q, dq) == pytest.approx(-0.1, abs=1e-4)
@@ -667,7 +667,7 @@ def test_velocity_rewards_switch_changes_three_terms_only():
 
 
 def test_tracking_difference_and_reward_run_over_the_same_joints():
-    width = {c.name: c.width for c in observations.CRITIC}["tracking_difference"]
+    width = {c.name: c.width for c in CRITIC}["tracking_difference"]
     assert width == 16
     for name in robot.load().joint_names:
         x = make_inputs(joint_pos=joints(**{name.removesuffix("_joint"): 0.5}))

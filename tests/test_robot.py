@@ -8,6 +8,7 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from states import MIRROR, XBOT
 
 from kslc_jax import motors, physics, randomize, robot
 
@@ -15,7 +16,7 @@ URDF = json.loads((Path(__file__).parent / "data" / "xbot_l_urdf.json").read_tex
 LEG = ("leg_roll", "leg_yaw", "leg_pitch", "knee", "ankle_pitch", "ankle_roll")
 ORDER = [f"{s}_{j}_joint" for s in ("left", "right") for j in LEG]
 ORDER += [f"{s}_{j}_joint" for s in ("left", "right") for j in ("shoulder_pitch", "elbow_pitch")]
-NOMINAL = jax.tree.map(np.asarray, randomize.nominal())
+NOMINAL = jax.tree.map(np.asarray, randomize.nominal(XBOT))
 
 
 def rotation(rpy):
@@ -287,7 +288,7 @@ def test_soles_are_where_the_feet_end(fidelity):
 def test_torso_box_is_humanoid_gyms(xbot):
     np.testing.assert_allclose(xbot.torso_box_center, [0, 0, 0.1])
     np.testing.assert_allclose(xbot.torso_box_half_size, 0.2)
-    assert xbot.mj_model.body(xbot.base_body_id).name == "base_link"
+    assert xbot.mj_model.body(xbot.anatomy.base).name == "base_link"
     assert xbot.default_qpos[2] == 0.95 and not xbot.default_qpos[7:].any()
 
 
@@ -483,7 +484,7 @@ def test_stands_on_its_feet(fidelity):
 
 def test_mirrored_joints_give_the_mirrored_robot(xbot):
     """Each body is at (x, -y, z) of its partner, up to the left-right differences in the URDF."""
-    permutation, sign = robot.mirror_joints()
+    permutation, sign = MIRROR
     q = np.random.default_rng(3).uniform(-0.4, 0.4, 16)
     np.testing.assert_allclose((q[permutation] * sign)[permutation] * sign, q)
     m = xbot.mj_model
@@ -498,7 +499,7 @@ def test_mirrored_joints_give_the_mirrored_robot(xbot):
 
 def test_mirrored_motion_is_the_mirror_image(xbot, poses):
     """The mirror negates y of velocities, x and z of angular velocities, and swaps joint limits."""
-    permutation, sign = robot.mirror_joints()
+    permutation, sign = MIRROR
     np.testing.assert_array_equal(sign * xbot.joint_upper[permutation], xbot.joint_lower)
     m, rates = xbot.mj_model, np.random.default_rng(6).normal(size=(len(poses), 16))
 

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 import tyro
+from states import XBOT
 
 import kslc_jax.evaluation
 from kslc_jax import curriculum, env, networks, randomize, robot, sim2sim
@@ -50,14 +51,14 @@ def actions(policy, **conditions):
 
 def dynamics(condition):
     """The dynamics and the contact friction under a condition."""
-    conditions = sim2sim.setting(sim2sim.Args("x"), condition).randomize
-    drawn = randomize.sample(conditions, jax.random.key(0))
+    conditions = sim2sim.setting(sim2sim.Args("x"), HighFidelity(), condition).randomize
+    drawn = randomize.sample(conditions, XBOT, jax.random.key(0))
     fields = randomize.model_fields(robot.load("high"), drawn, conditions.ground_friction)
     return drawn, fields["geom_friction"][robot.load("high").foot_geom_ids, 0]
 
 
 def test_the_nominal_robot_is_the_described_one_at_high_fidelity():
-    setting = sim2sim.setting(sim2sim.Args("x"), "nominal")
+    setting = sim2sim.setting(sim2sim.Args("x"), HighFidelity(), "nominal")
     assert setting.physics == HighFidelity() and setting.randomize == trials.NOMINAL
     assert setting.seconds == 60.0 and not setting.noise and not setting.latency
     drawn, friction = dynamics("nominal")
@@ -77,9 +78,9 @@ def test_perturbations_reach_the_robot():
     gains = dynamics("gains=0.85")[0]
     np.testing.assert_allclose(np.r_[gains.kp, gains.kd], 0.85, rtol=1e-6)
     np.testing.assert_allclose(dynamics("strength=0.9")[0].motor_strength, 0.9, rtol=1e-6)
-    push = sim2sim.setting(sim2sim.Args("x"), "push=0.5").randomize
+    push = sim2sim.setting(sim2sim.Args("x"), HighFidelity(), "push=0.5").randomize
     assert (push.push_seconds, push.push_velocity, push.push_angular) == (4.0, 0.5, 0.0)
-    assert sim2sim.setting(sim2sim.Args("x"), "imu=0.03").imu_offset == (0.03, 0.03)
+    assert sim2sim.setting(sim2sim.Args("x"), HighFidelity(), "imu=0.03").imu_offset == (0.03, 0.03)
 
 
 @pytest.mark.parametrize(
@@ -89,7 +90,9 @@ def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
     random_policy, condition, kg
 ):
     """The trace's mass is that of the model which the engine steps: 53.036 kg and the payload."""
-    setting = dataclasses.replace(sim2sim.setting(sim2sim.Args("x"), condition), seconds=0.03)
+    setting = dataclasses.replace(
+        sim2sim.setting(sim2sim.Args("x"), HighFidelity(), condition), seconds=0.03
+    )
     trace = next(iter(trials.run(random_policy, setting, np.zeros((2, 3)), chunk=0.03)))
     np.testing.assert_allclose(trace.mass, np.full((3, 2), 53.036 + kg), atol=1e-3)
     xbot = robot.load("high")
@@ -117,7 +120,11 @@ def test_headings_are_conditions():
     """The first one is that of all others."""
     args = sim2sim.Args("x", heading=(np.pi, 0.5), perturb=("payload=5",))
     assert args.conditions == ("nominal", "heading=0.5", "payload=5")
-    assert [sim2sim.setting(args, c).heading for c in args.conditions] == [np.pi, 0.5, np.pi]
+    assert [sim2sim.setting(args, HighFidelity(), c).heading for c in args.conditions] == [
+        np.pi,
+        0.5,
+        np.pi,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -234,5 +241,5 @@ def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
 
 @pytest.mark.parametrize("name", ["noise", "latency"])
 def test_a_condition_that_is_asked_for_is_set(name):
-    setting = sim2sim.setting(sim2sim.Args(Path("x"), **{name: True}), "payload=5")
+    setting = sim2sim.setting(sim2sim.Args(Path("x"), **{name: True}), HighFidelity(), "payload=5")
     assert (setting.noise, setting.latency) == (name == "noise", name == "latency")

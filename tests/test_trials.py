@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from states import ACTOR
 
 from kslc_jax import commands, curriculum, env, evaluate, networks, observations
 from kslc_jax import policy as policy_lib
@@ -45,7 +46,7 @@ def test_commands_hold(still):
     assert config.command.resample_seconds >= 10.0 and config.env.noise_level == 0.0
     assert config.randomize.push_seconds == 0.0
     step = jax.jit(env.step, static_argnums=0)
-    at = observations.slices(observations.ACTOR)["command"]
+    at = observations.slices(ACTOR)["command"]
     for wanted in ([1.5, 0.0, 0.0], [0.5, -0.3, 0.0], [1.0, 0.0, 0.4]):
         state = env.reset(config, jax.random.key(1), still.curriculum)
         for _ in range(3):

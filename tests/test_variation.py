@@ -8,12 +8,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from states import XBOT
 
 from kslc_jax import curriculum, networks, physics, randomize, robot
 from kslc_jax.config import ConfigError, HighFidelity, preset
 from kslc_jax.evaluation import disturbances, trials, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.policy import Policy
+from kslc_jax.robots import description
 
 DT = 0.01
 
@@ -21,8 +23,8 @@ DT = 0.01
 def changed(wanted: Variation, seed: int = 0) -> tuple[mujoco.MjModel, variation.Body]:
     """The high-fidelity model of one robot that differs."""
     xbot = robot.load("high")
-    body = variation.sample(wanted, jax.random.key(seed))
-    fields = randomize.model_fields(xbot, randomize.nominal(), 1.0)
+    body = variation.sample(wanted, xbot, jax.random.key(seed))
+    fields = randomize.model_fields(xbot, randomize.nominal(XBOT), 1.0)
     fields = variation.alter(wanted, xbot, body, jax.random.key(seed + 100), fields)
     model = copy.copy(xbot.mj_model)
     for name, value in fields.items():
@@ -43,7 +45,7 @@ def inverse_inertia(model: mujoco.MjModel) -> np.ndarray:
 
 def test_heavier_hands_are_point_masses_at_the_hands():
     """As MuJoCo has it with two more bodies."""
-    spec = mujoco.MjSpec.from_file(str(robot.MODEL_PATH))
+    spec = mujoco.MjSpec.from_file(str(description.read(robot.XBOT_L).mjcf))
     hands = robot.load("high").mj_model
     for side in ("left", "right"):
         at = hands.geom(f"{side}_hand").pos
@@ -135,8 +137,10 @@ def test_a_force_moves_the_whole_robot_as_newton_says():
     qpos = jnp.asarray(xbot.default_qpos, jnp.float32).at[2].set(3.0)
     state = physics.initial_state(config, qpos, jnp.zeros(xbot.mj_model.nv))
     target = qpos[7:]
-    force = jnp.zeros((xbot.mj_model.nbody, 6)).at[xbot.base_body_id, 1].set(300.0)
-    step = jax.jit(lambda s, f: physics.step(config, s, target, randomize.nominal(), 1.0, force=f))
+    force = jnp.zeros((xbot.mj_model.nbody, 6)).at[xbot.anatomy.base, 1].set(300.0)
+    step = jax.jit(
+        lambda s, f: physics.step(config, s, target, randomize.nominal(XBOT), 1.0, force=f)
+    )
 
     def momentum(s):
         data = mujoco.MjData(xbot.mj_model)

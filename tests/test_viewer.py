@@ -419,7 +419,7 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
     camera = robot.load("high").mj_model.vis.global_
     before = camera.fovy
     with pytest.raises(render.RenderError):
-        render.gait_strip(np.tile(xbot.default_qpos, (10, 1)), dt=0.1)
+        render.gait_strip(xbot, np.tile(xbot.default_qpos, (10, 1)), dt=0.1)
     assert camera.fovy == before != render.LONG_LENS
 
 

@@ -12,7 +12,6 @@ from kslc_jax.config.options import options
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
-    NUM_JOINTS,
     CommandConfig,
     Config,
     ConfigError,
@@ -36,7 +35,6 @@ from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
 __all__ = [
     "ABLATIONS",
     "COUNTER",
-    "NUM_JOINTS",
     "PRESETS",
     "SCHEMA_VERSION",
     "CommandConfig",

@@ -8,8 +8,6 @@ from typing import ClassVar, Literal
 
 from kslc_jax.errors import UserError
 
-NUM_JOINTS = 16
-
 Range = tuple[float, float]
 
 Fidelity = Literal["train", "high"]
@@ -57,6 +55,8 @@ class PhysicsConfig:
 
     fidelity: ClassVar[Fidelity] = "train"
 
+    robot: str = "xbot_l"
+    """Name of a shipped robot, or path of the description of another one (docs/own_robot.md)."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: pure XLA, any device. mujoco: C MuJoCo on the CPU cores, called back from JAX; faster on
     a CPU (docs/performance.md). auto: mjx if JAX has an accelerator, else mujoco."""

@@ -109,7 +109,7 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     plant.Finalize()
     _exclude(plant, scene, model)
     diagram = builder.Build()
-    base = plant.GetBodyByName(model.body(robot.base_body_id).name)
+    base = plant.GetBodyByName(model.body(robot.anatomy.base).name)
     joints = [plant.GetJointByName(name) for name in robot.joint_names]
     q, v = base.floating_positions_start(), base.floating_velocities_start_in_v()
     return World(

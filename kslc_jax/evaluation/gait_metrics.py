@@ -20,6 +20,9 @@ SETTLE = 2.0
 RESTING = 0.1
 """Mean forward speed [m/s]. At or below it, cost of transport and stride length are not defined."""
 
+RANGES = {"leg_pitch": "hip", "knee": "knee", "shoulder_pitch": "shoulder"}
+"""Metrics of joint ranges, and the roles of their joints."""
+
 MOMENTUM_EVERY = 0.05
 """Seconds between two samples of the limbs' angular momentum."""
 
@@ -153,30 +156,40 @@ def strides(trace: Trace, dt: float) -> dict[str, float]:
 def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     """Left-right differences of joint ranges, arm swing, and its correlation with the leg swing."""
     s = _steady(trace, dt)
-    q = np.asarray(s.qpos)[..., 7:]
-    names = list(robot.joint_names)
-    low, high = np.percentile(q, [5, 95], axis=0).mean(1)
-    span = dict(zip(names, high - low, strict=True))
+    forward = np.asarray(s.qpos)[..., 7:] * robot.anatomy.pitch  # rotations about y
+    low, high = np.percentile(forward, [5, 95], axis=0).mean(1)
+    span, roles = high - low, robot.anatomy.roles
     out = {
-        f"{joint}_range_difference": _difference(
-            span[f"left_{joint}_joint"], span[f"right_{joint}_joint"]
+        f"{name}_range_difference": _difference(
+            span[roles[f"left_{role}"]], span[roles[f"right_{role}"]]
         )
-        for joint in ("leg_pitch", "knee", "shoulder_pitch")
+        for name, role in RANGES.items()
+        if f"left_{role}" in roles
     }
-    out["shoulder_range"] = float(span["left_shoulder_pitch_joint"])
-    # On one side, shoulder and hip axes point the same way: equal signs swing both the same way.
+    if "left_shoulder" not in roles:
+        return out
+    out["shoulder_range"] = float(span[roles["left_shoulder"]])
     out["shoulder_hip_correlation"] = float(
         np.mean(
             [
                 _correlation(
-                    q[..., names.index(f"{side}_shoulder_pitch_joint")],
-                    q[..., names.index(f"{side}_leg_pitch_joint")],
+                    forward[..., roles[f"{side}_shoulder"]], forward[..., roles[f"{side}_hip"]]
                 )
                 for side in ("left", "right")
             ]
         )
     )
     return out
+
+
+def _bodies_of(robot: Robot, part: str) -> np.ndarray:
+    """[bodies] bool, True for the bodies of the limbs of this kind, "arm" or "leg"."""
+    first = [
+        robot.link_body_ids[1 + joints[0]]
+        for limb, joints in robot.anatomy.limbs.items()
+        if limb.endswith(part)
+    ]
+    return np.any(robot.subtree[first], axis=0)
 
 
 def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
@@ -222,9 +235,10 @@ def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
         mujoco.mju_rotVecQuat(data.qvel[:3], linvel[i], q[3:7])
         data.qvel[3:6], data.qvel[6:] = angvel[i], joints[i]
         bodies[i] = body_momentum(model, data)
-    names = [model.body(i).name for i in range(model.nbody)]
-    for part, words in {"arms": ("shoulder", "elbow"), "legs": ("leg", "knee", "ankle")}.items():
-        mine = [any(f"_{word}_" in name for word in words) for name in names]
+    for part in ("arms", "legs"):
+        mine = _bodies_of(robot, part.removesuffix("s"))
+        if not mine.any():
+            continue
         squares = (bodies[:, mine].sum(1) ** 2).mean(0)
         out[f"{part}_momentum_rms"] = float(np.sqrt(squares.sum()))
         out[f"{part}_momentum_yaw_rms"] = float(np.sqrt(squares[2]))

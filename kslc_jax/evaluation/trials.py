@@ -101,7 +101,8 @@ class Trial:
 
 def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
     """The physics that the policy was trained in ("train") or the high-fidelity one."""
-    return HighFidelity() if fidelity == "high" else policy.config.physics
+    trained = policy.config.physics
+    return HighFidelity(robot=trained.robot) if fidelity == "high" else trained
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
@@ -189,28 +190,28 @@ def _start(
 ) -> Trial:
     """One robot at rest that heads to `heading` [rad], under the command `wanted` [3] if there is
     no schedule."""
-    state = env.reset(config, key, curriculum)
+    state, robot = env.reset(config, key, curriculum), physics.robot_for(config.physics)
     own, key_body = jax.random.split(jax.random.fold_in(key, 1))
     leg = schedules.constant(wanted, heading)
     if setting.schedule:
         leg = schedules.before_start(heading)
     return Trial(
-        env=_face(state, heading),
+        env=_face(robot, state, heading),
         alive=jnp.ones((), bool),
         queue=jnp.zeros((setting.latency, len(state.last_action))),
         leg=leg,
         arms=state.physics.qpos[7:],
-        body=variation.sample(setting.variation, key_body),
+        body=variation.sample(setting.variation, robot, key_body),
         key=own,
         steps=jnp.zeros((), jnp.int32),
     )
 
 
-def _face(state: env.EnvState, heading: jax.Array) -> env.EnvState:
+def _face(robot: Robot, state: env.EnvState, heading: jax.Array) -> env.EnvState:
     """The robot that heads to yaw 0, turned to `heading` [rad], and so shown in its first frame."""
     zero = jnp.zeros(())
     quat = jnp.stack([jnp.cos(heading / 2), zero, zero, jnp.sin(heading / 2)])
-    at = observations.slices(observations.ACTOR)["base_euler"].stop - 1
+    at = observations.slices(observations.actor_table(robot))["base_euler"].stop - 1
     yaw = maths.quat_to_euler(quat)[2]
     return state.replace(
         physics=state.physics.replace(qpos=state.physics.qpos.at[3:7].set(quat)),
@@ -231,7 +232,7 @@ def _advance(
     if setting.hold_arms:
         arms = disturbances.walk_arms(robot, arms, trial.key, trial.steps, dt)
     state = with_command(config, trial.env, leg.velocity, leg.heading)
-    action = policy.act_on(state.history + _frame_error(setting))
+    action = policy.act_on(state.history + _frame_error(setting, robot))
     queue = jnp.concatenate([trial.queue, action[None]])
     simulate = _simulator(config, setting, robot, trial.replace(arms=arms), key)
     after, outcome = step(config, state, queue[0], key, policy.curriculum, simulate=simulate)
@@ -268,10 +269,11 @@ def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key
     return simulate
 
 
-def _frame_error(setting: Setting) -> np.ndarray:
-    """What the setting's sensor errors add to every actor frame [59]."""
-    error = np.zeros(observations.ACTOR_WIDTH, np.float32)
-    at = observations.slices(observations.ACTOR)["base_euler"].start
+def _frame_error(setting: Setting, robot: Robot) -> np.ndarray:
+    """What the setting's sensor errors add to every actor frame [W]."""
+    table = observations.actor_table(robot)
+    error = np.zeros(observations.width(table), np.float32)
+    at = observations.slices(table)["base_euler"].start
     error[at : at + 2] = setting.imu_offset
     return error
 

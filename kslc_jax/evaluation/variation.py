@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from kslc_jax.config import NUM_JOINTS
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
 
@@ -33,12 +32,12 @@ class Body:
     damping: jax.Array  # [16] N m s/rad
 
 
-def sample(variation: Variation, key: jax.Array) -> Body:
+def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:
     """Draws one robot."""
     key_friction, key_damping = jax.random.split(key)
     return Body(
-        friction=variation.joints * jax.random.uniform(key_friction, (NUM_JOINTS,)),
-        damping=variation.joints * jax.random.uniform(key_damping, (NUM_JOINTS,)),
+        friction=variation.joints * jax.random.uniform(key_friction, (robot.count,)),
+        damping=variation.joints * jax.random.uniform(key_damping, (robot.count,)),
     )
 
 
@@ -66,7 +65,7 @@ def alter(variation: Variation, robot: Robot, body: Body, key: jax.Array, fields
 
 
 def _heavier_hands(kg: float, robot: Robot, fields: Fields) -> Fields:
-    hands = np.array(_hand_bodies(robot))
+    hands = robot.hand_body_ids
     mass = fields["body_mass"].at[hands].add(kg)
     placed = {
         name: fields.get(name, jnp.asarray(getattr(robot.mj_model, name)))
@@ -78,19 +77,15 @@ def _heavier_hands(kg: float, robot: Robot, fields: Fields) -> Fields:
     return placed | {"body_mass": mass, "body_subtreemass": subtree}
 
 
-def _hand_bodies(robot: Robot) -> list[int]:
-    return [robot.mj_model.geom(f"{side}_hand").bodyid[0] for side in ("left", "right")]
-
-
 @functools.lru_cache(maxsize=32)
 def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
     """Centre, inertia and principal axes of all bodies, with point masses at the hands."""
     model = robot.mj_model
     names = ("body_ipos", "body_inertia", "body_iquat")
     out = {name: getattr(model, name).copy() for name in names}
-    for i, side in zip(_hand_bodies(robot), ("left", "right"), strict=True):
+    for i, hand in zip(robot.hand_body_ids, robot.hand_points, strict=True):
         mass, centre = model.body_mass[i], out["body_ipos"][i]
-        arm = model.geom(f"{side}_hand").pos - centre
+        arm = hand - centre
         axes = np.empty(9)
         mujoco.mju_quat2Mat(axes, model.body_iquat[i])
         axes = axes.reshape(3, 3)

@@ -10,7 +10,6 @@ import orbax.checkpoint as ocp
 
 from kslc_jax import files, ppo
 from kslc_jax.checkpoint_format import (
-    ROBOT_NUMBERS,
     CheckpointError,
     abstract,
     changed_robot,
@@ -84,7 +83,7 @@ class Store:
             return
         parts = _split(state)
         items = {name: ocp.args.StandardSave(part) for name, part in parts.items()}
-        meta = metadata(config, metrics, parts, fingerprint())
+        meta = metadata(config, metrics, parts, fingerprint(config.physics.robot))
         with self._writing():
             saved = self._manager.save(
                 step,
@@ -162,7 +161,7 @@ class Store:
         sums = meta.get("checksums", {})
         for name in items:
             require_checksum(sums, name, checksum(restored[name]))
-        changed = changed_robot(meta.get(ROBOT_NUMBERS))
+        changed = changed_robot(meta)
         return _join({name: restored[name] for name in items}, like), changed
 
     def close(self) -> None:
@@ -174,4 +173,4 @@ class Store:
 def policy_of(config: Config, state: TrainState) -> Policy:
     """The present policy of a training."""
     params, step = ppo.deployed(state.learner), int(state.step)
-    return Policy(config, params, state.curriculum, step, fingerprint())
+    return Policy(config, params, state.curriculum, step, fingerprint(config.physics.robot))

@@ -25,6 +25,7 @@ from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.evaluation import trials
 from kslc_jax.policy import Policy, load_policy
+from kslc_jax.robot import Robot
 from kslc_jax.viewer import panel
 from kslc_jax.viewer.following import Follower
 from kslc_jax.viewer.session import Pacer, Session, View
@@ -42,6 +43,9 @@ CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
 SPEED_SECONDS = 1.0
 """Window for the means of the actual speed and of the real-time factor [s]."""
 
+SHOWN_GROUP = 2
+"""Highest group of the geoms that are drawn, as in MuJoCo's own viewer."""
+
 SLOW = 0.95
 """Share of the chosen playback speed. Below it the page says "too slow"."""
 
@@ -50,7 +54,7 @@ SLOW = 0.95
 
 
 def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """The mesh of a primitive geom: in the frame of its body, in the colour of its material."""
+    """The mesh of a geom: in the frame of its body, in the colour of its material."""
     kinds, create = mujoco.mjtGeom, trimesh.creation
     size = model.geom_size[geom]
     kind = model.geom_type[geom]
@@ -64,16 +68,26 @@ def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
         shape = create.icosphere(subdivisions=3).apply_scale(size)
     elif kind == kinds.mjGEOM_SPHERE:
         shape = create.icosphere(subdivisions=3, radius=size[0])
+    elif kind == kinds.mjGEOM_MESH:
+        shape = trimesh.Trimesh(*mesh_data(model, int(model.geom_dataid[geom])), process=False)
     else:
         raise ValueError(f"geom {model.geom(geom).name}: no picture of a {kinds(kind).name}")
     placed = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
     placed[:3, 3] = model.geom_pos[geom]
     shape = trimesh.graph.smooth_shade(shape.apply_transform(placed))
-    rgba = model.mat_rgba[model.geom_matid[geom]].copy()
+    material = model.geom_matid[geom]
+    rgba = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]).copy()
     rgba[:3] **= GAMMA
     paint = PBRMaterial(baseColorFactor=rgba, metallicFactor=0.0, roughnessFactor=0.7)
     shape.visual = TextureVisuals(material=paint)
     return shape
+
+
+def mesh_data(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3, m] and faces [F, 3] of a mesh of the model."""
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
 
 
 class Figure:
@@ -83,11 +97,17 @@ class Figure:
     camera does not move. Without `follow` the world stays and the robot moves.
     """
 
-    def __init__(self, server: viser.ViserServer, model: mujoco.MjModel):
-        self._model, self._data = model, mujoco.MjData(model)
+    def __init__(self, server: viser.ViserServer, robot: Robot):
         self.follow = True
         self._server = server
-        scene = server.scene
+        self.draw(robot)
+
+    def draw(self, robot: Robot) -> None:
+        """Replaces what the scene shows by this robot, which must be of high fidelity."""
+        self.robot, model = robot, robot.mj_model
+        self._model, self._data = model, mujoco.MjData(model)
+        server, scene = self._server, self._server.scene
+        scene.reset()
         scene.configure_environment_map("studio", environment_intensity=0.4)
         server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
         server.initial_camera.fov = np.radians(FOV)
@@ -95,6 +115,8 @@ class Figure:
         self._bodies = {}
         for geom in range(model.ngeom):
             body = int(model.geom_bodyid[geom])
+            if model.geom_group[geom] > SHOWN_GROUP:
+                continue
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
                 self._add_floor(scene)
                 continue
@@ -164,6 +186,11 @@ def serve(host: str, port: int) -> viser.ViserServer:
         return viser.ViserServer(host, port, verbose=False)
 
 
+def shown_robot(policy: Policy) -> Robot:
+    """The policy's robot at high fidelity: some shapes of the training model must not be seen."""
+    return robot_lib.load("high", name=policy.config.physics.robot)
+
+
 class Viewer:
     """Shows one robot to every browser that opens the page."""
 
@@ -187,14 +214,15 @@ class Viewer:
         self._given = self._name = next(iter(self._policies))
         loaded = load_policy(folder)
         self.server = serve(host, port)
-        # Always the high-fidelity model: some shapes of the training model must not be seen.
-        self.figure = Figure(self.server, robot_lib.load("high").mj_model)
+        self.figure = Figure(self.server, shown_robot(loaded))
         self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
         self._rng = np.random.default_rng(seed)
         self._play(loaded)
 
     def _play(self, policy: Policy) -> None:
         """Starts a new session with this policy."""
+        if self.figure.robot is not shown_robot(policy):
+            self.figure.draw(shown_robot(policy))
         self.session = Session(policy, trials.engine(policy, self._fidelity), self._seed)
         self.session.advance(np.zeros(3))  # compiles
         self.panel.allow(float(policy.curriculum.v_max))

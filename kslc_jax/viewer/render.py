@@ -10,12 +10,15 @@ from collections.abc import Generator, Iterator, Sequence
 import mujoco
 import numpy as np
 
-from kslc_jax import robot as robot_lib
 from kslc_jax.errors import MissingPackage
+from kslc_jax.robot import Robot
 from kslc_jax.runtime import first_line
 
 LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
+
+EYE_LEVEL = 0.8
+"""Height [m] that the camera looks at, for XBot-L."""
 
 TALL = 2.0
 """Least height that a gait strip shows [m]."""
@@ -50,40 +53,54 @@ def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> m
 
 
 def frames(
-    qpos: np.ndarray, width: int = 640, height: int = 480, distance: float = 3.0
+    robot: Robot, qpos: np.ndarray, width: int = 640, height: int = 480, distance: float = 3.0
 ) -> Iterator[np.ndarray]:
-    """Pictures [height, width, 3] of a trajectory [T, 23]. The camera moves with the robot and
-    sees it from the side."""
-    model = robot_lib.load("high").mj_model
-    data, cam = mujoco.MjData(model), camera(distance)
+    """Pictures [height, width, 3] of a trajectory [T, 7 + n]. The camera moves with the robot and
+    sees it from the side.
+
+    Args:
+      robot: at high fidelity; some shapes of the training model must not be seen.
+      qpos: trajectory.
+      width, height: of a picture [pixels].
+      distance: of the camera [m] for a robot of XBot-L's height; a smaller robot is seen from
+        nearer.
+    """
+    model, size = robot.mj_model, robot.length_ratio
+    data, cam = mujoco.MjData(model), camera(distance * size)
     with _renderer(model, height, width) as renderer:
         for q in qpos:
             data.qpos[:] = q
             mujoco.mj_forward(model, data)
-            cam.lookat[:] = [q[0], q[1], 0.8]
+            cam.lookat[:] = [q[0], q[1], EYE_LEVEL * size]
             renderer.update_scene(data, cam)
             yield renderer.render()
 
 
 def gait_strip(
-    qpos: np.ndarray, dt: float, interval: float = 0.25, width: int = 1800, height: int = 420
+    robot: Robot,
+    qpos: np.ndarray,
+    dt: float,
+    interval: float = 0.25,
+    width: int = 1800,
+    height: int = 420,
 ) -> np.ndarray:
     """One picture: the robot every `interval` seconds on a 1 m floor grid, as the paper's figure.
 
     Args:
-      qpos: [T, 23] trajectory.
+      robot: at high fidelity.
+      qpos: [T, 7 + n] trajectory.
       dt: time between two rows of `qpos` [s].
       interval: time between two robots [s].
       width, height: of the picture [pixels].
     """
-    model = robot_lib.load("high").mj_model
+    model, size = robot.mj_model, robot.length_ratio
     shown = qpos[:: round(interval / dt)]
     middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
     cam = camera(0.0, elevation=-6.0)
     # A long lens far away shows every robot from the same side. The distance lets all fit in.
     half_height = np.tan(np.radians(LONG_LENS / 2))
-    cam.distance = 0.5 * max(length * height / width, TALL) / half_height
-    cam.lookat[:] = [middle, shown[:, 1].mean(), 0.8]
+    cam.distance = 0.5 * max(length * height / width, TALL * size) / half_height
+    cam.lookat[:] = [middle, shown[:, 1].mean(), EYE_LEVEL * size]
     data = mujoco.MjData(model)
     lens = _field_of_view(model, LONG_LENS)
     with lens, _renderer(model, height, width, max_geom=20_000) as renderer:
