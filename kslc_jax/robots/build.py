@@ -7,6 +7,7 @@ At high fidelity the MJCF's own shapes collide.
 """
 
 import functools
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -64,17 +65,18 @@ def spec(about: Description, fidelity: Literal["train", "high"]) -> mujoco.MjSpe
     make = _prepared if about.prepared else _derived
     try:
         return make(about, _compiled(about.mjcf, about.mjcf.stat().st_mtime), fidelity == "high")
-    except (ValueError, mujoco.FatalError) as error:
-        raise RobotError(f"{about.mjcf}: {' '.join(str(error).split())}") from None
     except RobotError as error:
-        known = str(error).startswith(str(about.path))
+        known = str(error).startswith((str(about.path), str(about.mjcf)))
         raise (error if known else RobotError(f"{about.path}: {error}")) from None
 
 
 @functools.lru_cache(maxsize=2)
 def _compiled(mjcf: Path, changed: float) -> mujoco.MjModel:
     """An MJCF as it is (cached, because meshes take seconds); `changed` is the file's time."""
-    return mujoco.MjModel.from_xml_path(str(mjcf))
+    try:
+        return mujoco.MjModel.from_xml_path(str(mjcf))
+    except (ValueError, mujoco.FatalError) as error:
+        raise RobotError(f"{mjcf}: {' '.join(str(error).split())}") from None
 
 
 def _prepared(about: Description, model: mujoco.MjModel, high: bool) -> mujoco.MjSpec:
@@ -87,10 +89,8 @@ def _prepared(about: Description, model: mujoco.MjModel, high: bool) -> mujoco.M
         )
     if about.stand_height is None or about.sole_drop is None:
         raise RobotError("prepared = true needs stand_height and sole_drop")
-    joints = list(range(1, model.njnt))
-    names = [model.joint(i).name for i in joints]
     (contacts.raise_prepared if high else contacts.train_prepared)(made)
-    motors = servos.motors(about, model, joints, names)
+    motors = servos.motors(about, model, list(range(1, model.njnt)))
     _finish(made, motors, high, about.stand_height, about.sole_drop)
     return made
 
@@ -107,7 +107,7 @@ def _finish(
 def _derived(about: Description, model: mujoco.MjModel, high: bool) -> mujoco.MjSpec:
     """The model of any other MJCF."""
     source = skeleton.at_home(about, model)
-    motors = servos.motors(about, model, source.joints, source.names)
+    motors = servos.motors(about, model, source.joints)
     made, sun, box = _stage(about.name)
     rig = _assemble(made, source)
     base = rig.body(rig.anatomy.base)
@@ -162,7 +162,7 @@ def _assemble(made: mujoco.MjSpec, source: Source) -> Rig:
 
 
 def _add_soles(rig: Rig, high: bool) -> None:
-    """Adds four spheres per foot, which touch the floor in training, and the touch sensors' sites."""
+    """Adds four spheres per foot, which touch the floor in training, and sites of touch sensors."""
     sphere = rig.spec.find_default("sole")
     radius = float(sphere.geom.size[0])
     for side, foot, sole in zip(SIDES, rig.anatomy.feet, rig.soles, strict=True):
@@ -193,17 +193,17 @@ def _add_capsules(rig: Rig) -> None:
             fromto=np.concatenate(ends),
             size=[capsule.radius, 0, 0],
         )
-    pairs = capsules.strangers(list(fitted))
-    near = {
+    free = [
+        pair
+        for pair in capsules.strangers(list(fitted))
+        if capsules.gap(*(fitted[name] for name in pair)) >= 0
+    ]
+    barred = {
         frozenset(map(capsules.geom_name, pair))
-        for pair in [*pairs, *_joined(list(fitted))]
-        if pair not in pairs or capsules.gap(*(fitted[name] for name in pair)) < 0
+        for pair in itertools.combinations(fitted, 2)
+        if pair not in free
     }
-    contacts.keep_parts_apart(rig.spec, [capsules.part(name) for name in fitted], near)
-
-
-def _joined(names: list[str]) -> list[tuple[str, str]]:
-    return [("trunk", name) for name in names if capsules.joined("trunk", name)]
+    contacts.keep_parts_apart(rig.spec, [capsules.part(name) for name in fitted], barred)
 
 
 def _add_shapes(rig: Rig) -> None:

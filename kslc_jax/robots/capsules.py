@@ -86,12 +86,12 @@ def fit(points: np.ndarray) -> Capsule:
       points: [k, 3] m. Dense parts of the cloud count no more than others.
     """
     cell = CELL * np.ptp(points, axis=0).max()
-    points = points[np.unique(np.round(points / cell), axis=0, return_index=True)[1]]
-    axes = np.linalg.eigh(np.cov(points.T))[1][:, ::-1]  # the principal axis first
-    local = points @ axes
-    lower, upper = local.min(axis=0), local.max(axis=0)
+    even = points[np.unique(np.round(points / cell), axis=0, return_index=True)[1]]
+    axes = np.linalg.eigh(np.cov(even.T))[1][:, ::-1]  # the principal axis first
+    lower, upper = (points @ axes).min(axis=0), (points @ axes).max(axis=0)
     middle, half = (lower + upper) / 2, (upper[0] - lower[0]) / 2
-    along, across = np.abs(local - middle)[:, 0], np.linalg.norm((local - middle)[:, 1:], axis=1)
+    offset = even @ axes - middle
+    along, across = np.abs(offset[:, 0]), np.hypot(offset[:, 1], offset[:, 2])
     best, size = (half, half), np.inf
     for straight in np.linspace(0.01, 1.0, 34) * half:
         beyond = np.maximum(along - straight, 0.0)

@@ -45,7 +45,7 @@ def high_options(spec: mujoco.MjSpec) -> None:
 
 
 def keep_parts_apart(
-    spec: mujoco.MjSpec, parts: Sequence[Part], neighbours: set[frozenset[str]]
+    spec: mujoco.MjSpec, parts: Sequence[Part], barred: set[frozenset[str]]
 ) -> None:
     """Adds contact pairs between parts that can touch at high fidelity, in place.
 
@@ -57,10 +57,10 @@ def keep_parts_apart(
     Args:
       spec: the training model; it has the capsules.
       parts: all parts.
-      neighbours: pairs of names of capsules that get no contact.
+      barred: pairs of names of capsules that get no contact.
     """
     for a, b in itertools.combinations(parts, 2):
-        if a.limb == b.limb or frozenset((a.geom, b.geom)) in neighbours:
+        if a.limb == b.limb or frozenset((a.geom, b.geom)) in barred:
             continue
         spec.add_pair(
             geomname1=a.geom,
@@ -84,13 +84,13 @@ def train_prepared(spec: mujoco.MjSpec) -> None:
     shapes = {g.parent.name: g for g in drawn}  # a bumper comes last and replaces the part
     feet = {g.parent.name for g in spec.geoms if g.priority > 0}
     excluded = {frozenset((e.bodyname1, e.bodyname2)) for e in spec.excludes}
-    neighbours = {
+    barred = {
         frozenset((a.name, b.name))
         for (body, a), (other, b) in itertools.combinations(shapes.items(), 2)
         if frozenset((body, other)) in excluded or a.parent.name == b.parent.parent.name
     }
     parts = [Part(g.name, _limb(g.parent), body in feet) for body, g in shapes.items()]
-    keep_parts_apart(spec, parts, neighbours)
+    keep_parts_apart(spec, parts, barred)
 
 
 def raise_prepared(spec: mujoco.MjSpec) -> None:

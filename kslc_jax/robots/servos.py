@@ -35,33 +35,37 @@ def matching(
     return found
 
 
-def motors(
-    description: Description, model: mujoco.MjModel, joints: list[int], names: list[str]
-) -> list[Motor]:
+def joint_names(model: mujoco.MjModel) -> list[str]:
+    """Names of all joints but the first, which is the free one."""
+    return [model.joint(i).name or f"joint{i}" for i in range(1, model.njnt)]
+
+
+def motors(description: Description, model: mujoco.MjModel, joints: list[int]) -> list[Motor]:
     """The motor of each joint, every field a number.
 
     Args:
       description: its [motors] go before the MJCF's values.
       model: the compiled MJCF.
       joints: ids in `model` of the joints that have a motor.
-      names: names of these joints.
 
     Raises:
       RobotError: a motor lacks a value; the message has the line to add.
     """
-    found = [_of_mjcf(model, joint) for joint in joints]
+    names = joint_names(model)
+    found = {joint: _of_mjcf(model, joint) for joint in joints}
     for i, given in matching(description, "motors", description.motors, names):
-        values = {k: v for k, v in asdict(given).items() if v is not None}
-        found[i] = replace(found[i], **values)
-    for name, motor in zip(names, found, strict=True):
+        if i + 1 in found:  # others are welded
+            values = {k: v for k, v in asdict(given).items() if v is not None}
+            found[i + 1] = replace(found[i + 1], **values)
+    for joint, motor in found.items():
         missing = [field for field in _REQUIRED if getattr(motor, field) is None]
         if missing:
-            line = ", ".join(f"{field} = ..." for field in missing)
+            name, line = names[joint - 1], ", ".join(f"{field} = ..." for field in missing)
             raise RobotError(
                 f"{description.path}: motors: joint {name!r} has no {', '.join(missing)}; "
                 f'add under [motors]: "{name}" = {{ {line} }}'
             )
-    return found
+    return list(found.values())
 
 
 def _of_mjcf(model: mujoco.MjModel, joint: int) -> Motor:

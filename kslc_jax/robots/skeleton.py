@@ -11,7 +11,7 @@ import numpy as np
 
 from kslc_jax.robots import anatomy
 from kslc_jax.robots.description import Description, RobotError
-from kslc_jax.robots.servos import matching
+from kslc_jax.robots.servos import joint_names, matching
 
 MAX_TILT = 0.35
 """Largest tilt [rad] of the base in the MJCF's keyframe."""
@@ -40,7 +40,7 @@ class Source:
 def at_home(description: Description, model: mujoco.MjModel) -> Source:
     """Poses the compiled MJCF and finds the joints that stay."""
     hinges = list(range(1, model.njnt))
-    names = [model.joint(i).name or f"joint{i}" for i in hinges]
+    names = joint_names(model)
     weld = matching(description, "weld", [(p, None) for p in description.weld], names)
     welded = frozenset(hinges[i] for i, _ in weld)
     anatomy.check(model, welded)
@@ -119,7 +119,7 @@ def grow(spec: mujoco.MjSpec, source: Source) -> dict[int, mujoco.MjsBody]:
         parent = bodies.get(int(source.carrier[above]), spec.worldbody)
         new = bodies[body] = parent.add_body(name=model.body(body).name or f"body{body}")
         if parent is spec.worldbody:
-            new.add_freejoint(name=model.joint(0).name or "root")
+            new.add_freejoint(name=model.joint(0).name)
         else:
             new.pos, new.quat = _place(source, body, above)
         _add_mass(new, source, body)
