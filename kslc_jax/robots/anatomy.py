@@ -29,7 +29,7 @@ _X, _Y, _Z = range(3)
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
-    """Parts of the robot. Joints are indices of the n hinges in MJCF order, which is action order."""
+    """Parts of the robot. Joints are indices of the n hinges in MJCF order, the action order."""
 
     permutation: np.ndarray  # [n] int: q[permutation] * sign is the mirrored joint vector
     sign: np.ndarray  # [n] float32, +1 or -1

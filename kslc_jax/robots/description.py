@@ -7,8 +7,8 @@
     [motors]                            # pattern = gains and limits, SI units
     knee = { kp = 200, kd = 5, effort = 139, speed = 20 }
 
-Patterns are regular expressions that are searched in joint names. A later entry wins. All fields but
-`mjcf` are optional: the MJCF's value holds where the description has none.
+Patterns are regular expressions that are searched in joint names. A later entry wins. All fields
+but `mjcf` are optional: the MJCF's value holds where the description has none.
 """
 
 import difflib

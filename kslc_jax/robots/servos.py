@@ -1,0 +1,116 @@
+"""Motors of a robot: the MJCF's values, then the description's, as position servos."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import asdict, replace
+from typing import TypeVar
+
+import mujoco
+import numpy as np
+
+from kslc_jax.robots.description import Description, Motor, RobotError
+
+Value = TypeVar("Value")
+
+_REQUIRED = ("kp", "kd", "effort", "speed")
+
+
+def matching(
+    description: Description, field: str, entries: Iterable[tuple[str, Value]], names: list[str]
+) -> list[tuple[int, Value]]:
+    """(index of a joint, value) of every pattern and every joint that it matches, in file order.
+
+    Raises:
+      RobotError: a pattern matches no joint.
+    """
+    found = []
+    for pattern, value in entries:
+        hits = [i for i, name in enumerate(names) if re.search(pattern, name)]
+        if not hits:
+            raise RobotError(
+                f"{description.path}: {field}: {pattern!r} matches no joint; "
+                f"there are {', '.join(names)}"
+            )
+        found += [(i, value) for i in hits]
+    return found
+
+
+def joint_names(model: mujoco.MjModel) -> list[str]:
+    """Names of all joints but the first, which is the free one."""
+    return [model.joint(i).name or f"joint{i}" for i in range(1, model.njnt)]
+
+
+def motors(description: Description, model: mujoco.MjModel, joints: list[int]) -> list[Motor]:
+    """The motor of each joint, every field a number.
+
+    Args:
+      description: its [motors] go before the MJCF's values.
+      model: the compiled MJCF.
+      joints: ids in `model` of the joints that have a motor.
+
+    Raises:
+      RobotError: a motor lacks a value; the message has the line to add.
+    """
+    names = joint_names(model)
+    found = {joint: _of_mjcf(model, joint) for joint in joints}
+    for i, given in matching(description, "motors", description.motors, names):
+        if i + 1 in found:  # others are welded
+            values = {k: v for k, v in asdict(given).items() if v is not None}
+            found[i + 1] = replace(found[i + 1], **values)
+    for joint, motor in found.items():
+        missing = [field for field in _REQUIRED if getattr(motor, field) is None]
+        if missing:
+            name, line = names[joint - 1], ", ".join(f"{field} = ..." for field in missing)
+            raise RobotError(
+                f"{description.path}: motors: joint {name!r} has no {', '.join(missing)}; "
+                f'add under [motors]: "{name}" = {{ {line} }}'
+            )
+    return list(found.values())
+
+
+def _of_mjcf(model: mujoco.MjModel, joint: int) -> Motor:
+    """What an MJCF says about one joint's motor."""
+    dof = model.jnt_dofadr[joint]
+    motor = Motor(
+        armature=float(model.dof_armature[dof]),
+        friction=float(model.dof_frictionloss[dof]),
+        damping=float(model.dof_damping[dof]),
+    )
+    efforts = []
+    if model.jnt_actfrclimited[joint]:
+        efforts.append(np.abs(model.jnt_actfrcrange[joint]).max())
+    drives = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
+        model.actuator_trnid[:, 0] == joint
+    )
+    for i in np.flatnonzero(drives):
+        gear, gain = abs(model.actuator_gear[i, 0]), model.actuator_gainprm[i, 0]
+        if model.actuator_forcelimited[i]:
+            efforts.append(gear * np.abs(model.actuator_forcerange[i]).max())
+        if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
+            kd = -float(model.actuator_biasprm[i, 2]) * gear**2
+            motor = replace(motor, kp=float(gain) * gear**2, kd=kd if kd > 0 else None)
+        elif model.actuator_ctrllimited[i]:
+            efforts.append(gear * gain * np.abs(model.actuator_ctrlrange[i]).max())
+    return replace(motor, effort=float(min(efforts))) if efforts else motor
+
+
+def add_servos(spec: mujoco.MjSpec, motors: list[Motor], high: bool) -> None:
+    """Replaces all actuators by one position servo per hinge, in joint order.
+
+    Joint friction is 0 in training, where the environment draws it in each episode.
+    """
+    for actuator in list(spec.actuators):
+        spec.delete(actuator)
+    hinges = [j for j in spec.joints if j.type == mujoco.mjtJoint.mjJNT_HINGE]
+    for joint, motor in zip(hinges, motors, strict=True):
+        joint.armature = motor.armature
+        joint.frictionloss = motor.friction if high else 0.0
+        if high:
+            linear = joint.damping
+            joint.damping = motor.damping if np.ndim(linear) == 0 else [motor.damping, *linear[1:]]
+        servo = spec.add_actuator(
+            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
+        )
+        servo.set_to_position(kp=motor.kp, kv=motor.kd)
+        servo.forcerange = [-motor.effort, motor.effort]
+    spec.add_numeric(name="speed_limit", data=[motor.speed for motor in motors])
