@@ -4,8 +4,11 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax.config import RandomizeConfig, Range
+from kslc_jax.config import ConfigError, RandomizeConfig, Range
 from kslc_jax.robot import Robot
+
+LIGHTEST = 0.05
+"""Smallest share of the trunk's mass that must stay when mass is taken away."""
 
 
 @flax.struct.dataclass
@@ -44,7 +47,18 @@ def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
 
 
 def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
-    """Draws the parameters of one episode. Each is uniform in its configured range."""
+    """Draws the parameters of one episode. Each is uniform in its configured range.
+
+    Raises:
+      ConfigError: the trunk could become too light.
+    """
+    trunk = float(robot.mj_model.body_mass[robot.trunk_body_id])
+    left = trunk * config.link_mass[0] + config.base_mass[0]
+    if left < LIGHTEST * trunk:
+        raise ConfigError(
+            f"randomize.base_mass: {config.base_mass[0]:g} kg leave {left:.1f} of the trunk's "
+            f"{trunk:.1f} kg; at least {LIGHTEST:.0%} must stay"
+        )
     keys = jax.random.split(key, 11)
     joints, links = (robot.count,), (robot.count + 1,)
 

@@ -8,35 +8,17 @@ One description gives two models:
 """
 
 import functools
-import itertools
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
 from kslc_jax.config import Fidelity
-from kslc_jax.robots import anatomy, description
+from kslc_jax.robots import anatomy, build, description
 from kslc_jax.robots.anatomy import Anatomy
 
 XBOT_L = "xbot_l"
 """The robot of the paper. Presets are made for it; `mass_ratio` and `length_ratio` refer to it."""
-
-_FLOOR_BIT, _PART_BIT = 1, 2
-_DECOR_GROUP = 1
-"""Geom group of shapes that never collide."""
-_BUMPER_GROUP = 5
-"""Geom group of capsules that replace parts of other shapes in training; never drawn."""
-
-PAIR_MARGIN = 0.012
-"""Distance [m] below which two parts repel each other in training.
-
-A policy uses all of the allowed space, and simulators differ a little. Without this margin policies
-trip at high fidelity (docs/fidelity_physics.md)."""
-
-PAIR_CONTACTS = 9
-"""Contacts of each condim that MJX solves: those with the smallest distance.
-
-All 9 contacts with friction fit: 8 sole spheres on the floor, and 1 pair of feet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +48,8 @@ class Robot:
     total_mass: float  # kg
     stand_height: float  # m, base above the soles at home
     sole_drop: float  # m, frame of a foot above its sole
+    feet_apart: float  # m, distance of the feet at home
+    knees_apart: float  # m, distance of the knees at home
     mass_ratio: float  # total mass by XBot-L's
     length_ratio: float  # standing height by XBot-L's
 
@@ -127,16 +111,8 @@ def load(
     Raises:
       RobotError: no such robot, or one that cannot be used.
     """
-    described = description.read(name)
-    spec = mujoco.MjSpec.from_file(str(described.mjcf))
-    if fidelity == "high":
-        _raise_fidelity(spec)
-    else:
-        _keep_parts_apart(spec)
+    spec = build.spec(description.read(name), fidelity)
     model = spec.compile()
-    if fidelity == "high":
-        for field in ("frictionloss", "damping"):
-            getattr(model, f"dof_{field}")[6:] = model.numeric(f"high_{field}").data
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
@@ -151,7 +127,7 @@ def load(
     parts, links = anatomy.study(model, home), model.jnt_bodyid[joints]
     hands = [links[arm[-1]] for limb, arm in parts.limbs.items() if limb.endswith("arm")]
     box, mass = model.site("torso_box"), float(model.body_subtreemass[0])
-    stand_height = described.stand_height or 0.0
+    stand_height = float(model.numeric("stand_height").data[0])
     xbot = load() if (name, fidelity) != (XBOT_L, "train") else None
     return Robot(
         mj_model=model,
@@ -176,10 +152,21 @@ def load(
         torso_box_half_size=box.size.copy(),
         total_mass=mass,
         stand_height=stand_height,
-        sole_drop=described.sole_drop or 0.0,
+        sole_drop=float(model.numeric("sole_drop").data[0]),
+        feet_apart=_apart(model, "foot_pos"),
+        knees_apart=_apart(model, "knee_pos"),
         mass_ratio=mass / xbot.total_mass if xbot else 1.0,
         length_ratio=stand_height / xbot.stand_height if xbot else 1.0,
     )
+
+
+def _apart(model: mujoco.MjModel, sensor: str) -> float:
+    """Lateral distance [m] of the left and the right position sensor of this name, at home."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
+    mujoco.mj_forward(model, data)
+    left, right = (data.sensor(f"{side}_{sensor}").data[1] for side in ("left", "right"))
+    return float(left - right)
 
 
 def _hand_points(model: mujoco.MjModel, hands: list[int]) -> np.ndarray:
@@ -212,56 +199,3 @@ def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
     inverse = np.zeros((model.nv, model.nv))
     mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
     return 1.0 / np.diag(inverse)[6:]
-
-
-def _raise_fidelity(spec: mujoco.MjSpec) -> None:
-    """Turns the training model into the evaluation model, in place."""
-    spec.option.timestep = 0.001
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.iterations = 100
-    spec.option.ls_iterations = 50
-    spec.option.tolerance = 1e-10
-    for stand_in in (g for g in spec.geoms if g.group == _BUMPER_GROUP):
-        spec.delete(stand_in)
-    sole = next(g for g in spec.geoms if g.priority > 0)
-    friction, priority = sole.friction.copy(), sole.priority
-    for geom in spec.geoms:
-        if geom.priority > 0:  # the foot boxes replace the sole spheres
-            geom.contype = 0
-        elif geom.parent.name != "world" and geom.group != _DECOR_GROUP:
-            geom.contype, geom.conaffinity = _FLOOR_BIT | _PART_BIT, _PART_BIT
-        if geom.name in ("left_foot", "right_foot"):
-            geom.friction, geom.priority = friction, priority
-
-
-def _keep_parts_apart(spec: mujoco.MjSpec) -> None:
-    """Adds contact pairs between parts that can touch at high fidelity, in place.
-
-    One capsule represents each part. Parts of different limbs can touch, and parts of a limb can
-    touch the trunk. Neighbours cannot, as at high fidelity. Only the pair of feet has friction,
-    because friction between the feet makes the robot trip. All other pairs are frictionless: such a
-    contact costs the solver one row instead of four.
-    """
-    capsules = [g for g in spec.geoms if g.type == mujoco.mjtGeom.mjGEOM_CAPSULE]
-    parts = sorted((g for g in capsules if g.group != _DECOR_GROUP), key=lambda g: g.group)
-    shapes = {g.parent.name: g for g in parts}  # a bumper comes last and replaces the part
-    feet = {g.parent.name for g in spec.geoms if g.priority > 0}
-    neighbours = {frozenset((e.bodyname1, e.bodyname2)) for e in spec.excludes}
-    for (name, a), (other, b) in itertools.combinations(shapes.items(), 2):
-        related = _limb(a.parent) == _limb(b.parent) or a.parent.name == b.parent.parent.name
-        if related or frozenset((name, other)) in neighbours:
-            continue
-        spec.add_pair(
-            geomname1=a.name,
-            geomname2=b.name,
-            condim=3 if {name, other} <= feet else 1,
-            margin=PAIR_MARGIN,
-        )
-    spec.add_numeric(name="max_contact_points", data=[PAIR_CONTACTS])
-
-
-def _limb(body: mujoco.MjsBody) -> str:
-    """Name of the first body of the limb that `body` belongs to; for the trunk, its own name."""
-    while body.parent.name != "world" and body.parent.parent.name != "world":
-        body = body.parent
-    return body.name

@@ -1,4 +1,4 @@
-"""Train XBot-L to walk and run: python -m kslc_jax.train [--preset NAME] [--any.nested.field V]
+"""Train a robot to walk and run: python -m kslc_jax.train [--preset NAME] [--any.nested.field V]
 
 Picks a preset, lets every field of it be overridden, and trains into a run folder that holds the
 config, versions, metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and leaves;
@@ -8,6 +8,7 @@ named before --help.
 Examples:
   python -m kslc_jax.train                          # the laptop preset, on a GPU if there is one
   python -m kslc_jax.train --preset debug           # seconds, to see that everything works
+  python -m kslc_jax.train --robot unitree_g1       # another shipped robot, or my/robot.toml
   python -m kslc_jax.train --preset laptop --without arms --seed 1
   python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
   python -m kslc_jax.train --resume --run-dir runs/laptop-seed0
@@ -26,10 +27,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from kslc_jax import cli, runtime
+from kslc_jax import cli, runtime, similar
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
+from kslc_jax.robot import XBOT_L
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -44,11 +46,15 @@ class Args:
 
     preset: str = DEFAULT
     """paper, laptop, debug, baseline or baseline-laptop."""
+    robot: str = XBOT_L
+    """xbot_l, unitree_g1, unitree_h1, booster_t1, berkeley_humanoid, or the path of a description
+    (docs/own_robot.md). The preset is scaled to the robot's size."""
     without: tuple[str, ...] = ()
     """Parts to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
     run_dir: Path | None = None
-    """Folder for everything; runs/PRESET-seedN if not given, with -no-PART for each ablation."""
+    """Folder for everything; runs/PRESET-seedN if not given, with the name of another robot than
+    xbot_l in front, and with -no-PART for each ablation."""
     steps: int | None = None
     """Environment steps in all, from the beginning of the run; 60e6 is a number, too. Short for
     --run.steps."""
@@ -114,6 +120,7 @@ def parse(argv: list[str]) -> Args:
     """Args, with `config` made of preset or stored config, ablations and overrides; ConfigError."""
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset")
+    early.add_argument("--robot")
     early.add_argument("--without", nargs="*", default=[])
     early.add_argument("--run-dir", "--run_dir", type=Path)
     early.add_argument("--resume", action="store_true")
@@ -121,12 +128,14 @@ def parse(argv: list[str]) -> Args:
     helping = "-h" in argv or "--help" in argv
     if known.resume and known.run_dir is None and not helping:
         raise ConfigError("--resume needs --run-dir, the folder of the training to go on with")
-    if known.resume and not helping and known.preset is None and not known.without:
+    fresh = known.preset is not None or known.robot is not None or known.without
+    if known.resume and not helping and not fresh:
         from kslc_jax.training import run_folder
 
         base = run_folder.read_config(known.run_dir)
     else:  # also on resume: run_folder names what the stored config has otherwise
-        base = config_lib.preset(known.preset or DEFAULT, tuple(known.without))
+        name, robot = known.preset or DEFAULT, known.robot or XBOT_L
+        base = similar.preset(name, robot, tuple(known.without))
     args = cli.parse("train", Args, argv, __doc__, default=Args(config=base))
     if args.resume and args.start_from:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
@@ -143,6 +152,8 @@ def headline(args: Args) -> tuple[str, Path]:
     if args.resume and args.run_dir is not None:
         return "resuming", args.run_dir
     name = "-no-".join([args.preset, *args.without])
+    if args.robot != XBOT_L:
+        name = f"{Path(args.robot).stem}-{name}"
     folder = args.run_dir or Path("runs") / f"{name}-seed{args.config.seed}"
     return f"preset {name}", folder
 

@@ -292,10 +292,6 @@ class RandomizeConfig:
             value = getattr(self, f.name)
             if isinstance(value, tuple):
                 _check_range(f"randomize.{f.name}", value)
-        require(
-            self.base_mass[0] > -20,
-            "randomize.base_mass must be above -20: the base link weighs 21 kg",
-        )
         for name in (
             "kp",
             "kd",

@@ -1,0 +1,135 @@
+"""Presets for a robot of any size, by dynamic similarity with XBot-L.
+
+Two robots of the same shape move alike if lengths scale with l, times and speeds with sqrt(l),
+forces with m, torques with m l and angular momenta with m l sqrt(l). l is the ratio of the standing
+heights, m that of the masses. Sums over the joints also scale with their number. XBot-L has
+l = m = 1, and its presets stay as they are. docs/own_robot.md explains each rule and its limits.
+"""
+
+import dataclasses
+import math
+import operator
+from functools import reduce
+from typing import Any
+
+from kslc_jax import config as config_lib
+from kslc_jax import robot as robot_lib
+from kslc_jax.config import Config, ConfigError
+from kslc_jax.robot import Robot
+from kslc_jax.robots import description
+
+DIGITS = 3
+"""Significant digits of a scaled number: more would claim an accuracy that similarity lacks."""
+
+
+def preset(name: str, robot: str = robot_lib.XBOT_L, without: tuple[str, ...] = ()) -> Config:
+    """The named preset for a robot: scaled, then with the [config] of the robot's description.
+
+    Args:
+      name: of the preset.
+      robot: a shipped robot, or the path of a description.
+      without: ablations.
+
+    Raises:
+      ConfigError: unknown preset, ablation or field, or a value that cannot work.
+      RobotError: unknown robot, or one that cannot be used.
+    """
+    about, config = description.read(robot), config_lib.preset(name, without)
+    where = robot if robot in description.known() else str(about.path)
+    physics = dataclasses.replace(config.physics, robot=where)
+    config = scaled(dataclasses.replace(config, physics=physics), robot_lib.load(name=where))
+    for field, value in about.config:
+        config = _replaced(config, field, value, f"{about.path}: config")
+    return config
+
+
+def scaled(config: Config, robot: Robot) -> Config:
+    """A config for XBot-L, scaled to another robot."""
+    changes = {
+        field: _times(_get(config, field), factor)
+        for field, factor in factors(robot).items()
+        if factor != 1.0
+    }
+    for field, value in changes.items():
+        config = _replaced(config, field, value, "scaled")
+    return config
+
+
+def factors(robot: Robot) -> dict[str, float]:
+    """Factor on each config field that depends on the robot's size, by the field's dotted name."""
+    xbot = robot_lib.load()
+    length, mass = robot.length_ratio, robot.mass_ratio
+    time = math.sqrt(length)  # of speeds too
+    joints = xbot.count / robot.count
+    return {
+        "command.vy": time,
+        "command.dead_zone": time,
+        "command.slow_speed": time,
+        "command.narrow_speed": time,
+        "gait.cycle_time": time,
+        "gait.full_speed": time,
+        "gait.cycle_from_speed": time,
+        "curriculum.v_min": time,
+        "curriculum.v_start": time,
+        "curriculum.v_step": time,
+        "curriculum.v_limit": time,
+        "curriculum.cycle_min": time,
+        "curriculum.top_error_floor": time,
+        "randomize.base_mass": mass,
+        "randomize.base_com": length,
+        "randomize.link_com": length,
+        "randomize.hand_mass": mass,
+        "randomize.joint_friction": mass * length,
+        "randomize.push_velocity": time,
+        "randomize.push_angular": 1.0 / time,
+        "rewards.momentum_scale": mass * length * time,
+        "rewards.base_height_target": length,
+        "rewards.base_height_kernel": 1.0 / length,
+        "rewards.clearance_target": length,
+        "rewards.clearance_width": length,
+        "rewards.max_contact_force": mass,
+        "rewards.feet_distance": robot.feet_apart / xbot.feet_apart,
+        "rewards.knee_distance": robot.knees_apart / xbot.knees_apart,
+        "rewards.lean_per_speed": 1.0 / time,
+        "rewards.exact_from": time,
+        "rewards.exact_full": time,
+        "rewards.joint_pos_kernel": math.sqrt(joints),
+        "rewards.joint_pos_penalty": math.sqrt(joints),
+        "rewards.joint_pos_clip": 1.0 / math.sqrt(joints),
+        "rewards.weights.feet_air_time": 1.0 / time,
+        "rewards.weights.foot_slip": 1.0 / math.sqrt(time),
+        "rewards.weights.feet_contact_forces": 1.0 / mass,
+        "rewards.weights.action_smoothness": joints,
+        "rewards.weights.torques": joints / (mass * length) ** 2,
+        "rewards.weights.dof_vel": joints * length,
+        "rewards.weights.dof_acc": joints * length**2,
+    }
+
+
+def _times(value: Any, factor: float) -> Any:
+    """A number or a range, times a factor."""
+    if isinstance(value, tuple):
+        return tuple(_times(part, factor) for part in value)
+    return float(f"{value * factor:.{DIGITS}g}") if abs(value) < 1e8 else value  # 1e9: switched off
+
+
+def _get(config: Config, field: str) -> Any:
+    return reduce(getattr, field.split("."), config)
+
+
+def _replaced(config: Any, field: str, value: Any, where: str) -> Any:
+    """The config with another value of a dotted field."""
+    name, _, rest = field.partition(".")
+    names = [f.name for f in dataclasses.fields(config)]
+    if name not in names:
+        raise ConfigError(f"{where}: unknown field {name!r}; there are {', '.join(names)}")
+    old = operator.attrgetter(name)(config)
+    if rest:
+        if not dataclasses.is_dataclass(old):
+            raise ConfigError(f"{where}: {name!r} has no field {rest!r}")
+        return dataclasses.replace(config, **{name: _replaced(old, rest, value, where)})
+    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not type(old):
+        raise ConfigError(f"{where}: {name}: {value!r} is not a valid value")
+    return dataclasses.replace(config, **{name: value})
