@@ -1,4 +1,4 @@
-"""Runs an exported policy on XBot-L in MuJoCo: numpy, onnxruntime, no JAX (docs/export.md).
+"""Runs an exported policy on its robot in MuJoCo: numpy, onnxruntime, no JAX (docs/export.md).
 
 python examples/onnx_runner.py policy.onnx --vx 1.0 --seconds 10
 """
@@ -43,7 +43,7 @@ class Controller:
         """The observation frame of one control step.
 
         quat: base orientation (w, x, y, z). angvel: [3] rad/s, in the base frame. joint_pos,
-        joint_vel: [16] rad and rad/s.
+        joint_vel: [n] rad and rad/s.
         """
         m, (w, x, y, z) = self.meta, quat
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
@@ -53,7 +53,8 @@ class Controller:
         rate = np.clip(rate, -m.command.max_yaw_rate, m.command.max_yaw_rate)
         moving = not m.command.stand_still or self.velocity.any() or abs(rate) > m.command.turning
         angle = 2 * np.pi * self.phase
-        values = dict(joint_pos=joint_pos, joint_vel=joint_vel, last_action=self.action)
+        offset = joint_pos - np.array(m.default_joint_pos)
+        values = dict(joint_pos=offset, joint_vel=joint_vel, last_action=self.action)
         values |= dict(base_angvel=angvel, base_euler=np.array([roll, pitch, yaw]))
         values["clock"] = moving * np.array([np.sin(angle), np.cos(angle)])
         values["command"] = moving * np.array([*self.velocity, rate])
@@ -124,11 +125,13 @@ if __name__ == "__main__":
     parser.add_argument("policy", help="file written by python -m kslc_jax.export")
     parser.add_argument("--vx", type=float, default=1.0, help="commanded forward speed [m/s]")
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--model", help="the robot's MJCF; the file that lies beside the policy")
     args = parser.parse_args()
-    if not Path(args.policy).is_file():
-        parser.error(f"no file '{args.policy}'")
-    xbot_l = Path(__file__).resolve().parents[1] / "kslc_jax" / "robots" / "xbot_l.xml"
-    model, controller = mujoco.MjModel.from_xml_path(str(xbot_l)), Controller(args.policy, args.vx)
+    mjcf = Path(args.model or Path(args.policy).with_suffix(".xml"))
+    for path in (Path(args.policy), mjcf):
+        if not path.is_file():
+            parser.error(f"no file '{path}'")
+    model, controller = mujoco.MjModel.from_xml_path(str(mjcf)), Controller(args.policy, args.vx)
     model.opt.timestep = 0.001  # with 5 ms the motors cannot keep a shank within its speed limit
     track, dt = simulate(controller, model, args.seconds), controller.meta.control_dt
     speed = np.diff(track[len(track) // 2 :, 0]).mean() / dt

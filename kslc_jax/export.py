@@ -1,8 +1,8 @@
 """Takes a policy elsewhere: python -m kslc_jax.export POLICY policy.onnx
 
 Writes the network `history [batch, K, 59] -> action [batch, 16]` together with everything that a
-robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. OUT ends in
-.onnx or .stablehlo (read back by jax.export; the data go beside it in OUT.json). The file is then
+robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. The robot's
+model, as MJCF without meshes, goes beside it: policy.xml. OUT ends in .onnx or .stablehlo (read back by jax.export; the data go beside it in OUT.json). The file is then
 compared with JAX over observations of the policy at work. With --format orbax OUT is a folder that
 `kslc_jax.load_policy` reads: config and actor-critic parameters, without the rest of a checkpoint.
 See docs/export.md.
@@ -112,6 +112,15 @@ def metadata(policy: Policy) -> dict[str, Any]:
             "turning": commands.TURNING,
         },
     }
+
+
+def mjcf(policy: Policy) -> str:
+    """The training model of the policy's robot, as the text of an MJCF."""
+    from kslc_jax.robots import build, description
+
+    spec = build.spec(description.read(policy.config.physics.robot), "train")
+    spec.compile()
+    return spec.to_xml()
 
 
 # ------------------------------------------------------------------------------------------- onnx
@@ -341,8 +350,9 @@ def _write(policy: Policy, args: Args) -> None:
 
     if args.chosen == "orbax":
         save_policy(policy, args.out)
-    else:
-        args.out.write_bytes(WRITE[args.chosen](policy))
+        return
+    args.out.write_bytes(WRITE[args.chosen](policy))
+    args.out.with_suffix(".xml").write_text(mjcf(policy))
     if args.chosen == "stablehlo":
         files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
 

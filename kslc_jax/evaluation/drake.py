@@ -35,7 +35,7 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
 
 from kslc_jax import motors, physics
-from kslc_jax.config import PhysicsConfig
+from kslc_jax.config import ConfigError, PhysicsConfig
 from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics, model_fields
 from kslc_jax.robot import Robot
@@ -94,7 +94,11 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     """Builds the robot on a half space, with the parameters of `model`.
 
     `model` is the robot's model or a changed copy. All shapes have the friction of the feet.
+
+    Raises:
+      ConfigError: a robot whose frames or feet this bridge cannot pass on.
     """
+    _require_plain(robot, model)
     builder = DiagramBuilder()
     settings = MultibodyPlantConfig(
         time_step=model.opt.timestep,
@@ -123,6 +127,19 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
         q_index=np.r_[q + 4 : q + 7, q : q + 4, [j.position_start() for j in joints]],
         v_index=np.r_[v + 3 : v + 6, v : v + 3, [j.velocity_start() for j in joints]],
     )
+
+
+def _require_plain(robot: Robot, model: mujoco.MjModel) -> None:
+    """ConfigError if frames are rotated or offset, or if a foot is no single box."""
+    moved = model.body_jntnum[1:] == 0
+    turned = ~np.all(np.isclose(model.body_quat[1:], [1.0, 0.0, 0.0, 0.0]), axis=1)
+    shifted = np.any(model.jnt_pos != 0.0, axis=1)
+    named = all(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) >= 0 for foot in FEET)
+    if moved.any() or turned.any() or shifted.any() or not named:
+        raise ConfigError(
+            f"engine: drake takes robots with aligned frames and boxes as feet only, as XBot-L is; "
+            f"{robot.name} is not: take --engine mujoco"
+        )
 
 
 def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> None:
