@@ -1,7 +1,7 @@
 """Description and MJCF -> the training model or the evaluation model, as an MjSpec.
 
 An MJCF of ours (`prepared`) has all that the package reads by name. Any other MJCF gets it here:
-its bodies and joints are rebuilt on our ground (skeleton.py), with soles of four spheres
+its bodies and joints are rebuilt on XBot-L's floor (skeleton.py), with soles of four spheres
 (soles.py), sites, sensors and servos. In training one capsule stands for each part (capsules.py).
 At high fidelity the MJCF's own shapes collide.
 """
@@ -36,7 +36,7 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A robot on its way: its bodies stand in the spec, shapes and sensors do not."""
+    """A robot under construction: the spec has its bodies and joints, but no shapes and sensors."""
 
     spec: mujoco.MjSpec
     source: Source
@@ -184,7 +184,9 @@ def _add_capsules(rig: Rig) -> None:
     """Adds one capsule per part, and the contact pairs of training."""
     members = capsules.parts(rig.bare, rig.anatomy)
     clouds = {name: rig.points(bodies) for name, bodies in members.items()}
-    fitted = capsules.slim(capsules.fit_all(clouds))
+    wider = capsules.with_hips(rig.bare, rig.anatomy)
+    hips = {name: rig.points(bodies) for name, bodies in wider.items()}
+    fitted = capsules.slim(capsules.fit_all(clouds, hips))
     style = rig.spec.find_default("bumper")
     for name, capsule in fitted.items():
         body = members[name][0]
