@@ -84,8 +84,11 @@ def check(model: mujoco.MjModel, welded: frozenset[int] = frozenset()) -> None:
     if model.neq or model.ntendon:
         kind = "equality constraints" if model.neq else "tendons"
         raise RobotError(f"{kind} (closed loops) are not supported: remove them from the MJCF")
+    base = model.jnt_bodyid[0]
     for i in (i for i in range(1, model.njnt) if i not in welded):
         name = model.joint(i).name
+        if model.body_rootid[model.jnt_bodyid[i]] != base:
+            raise RobotError(f"joint {name!r} is not on the robot: remove it from the MJCF")
         if model.jnt_type[i] != hinge:
             raise RobotError(f"joint {name!r} is no hinge: weld it, or remove it from the MJCF")
         if not model.jnt_limited[i]:

@@ -1,7 +1,7 @@
 """Description and MJCF -> the training model or the evaluation model, as an MjSpec.
 
 An MJCF of ours (`prepared`) has all that the package reads by name. Any other MJCF gets it here:
-its bodies and joints are rebuilt on our ground (skeleton.py), with soles of four spheres
+its bodies and joints are rebuilt on XBot-L's floor (skeleton.py), with soles of four spheres
 (soles.py), sites, sensors and servos. In training one capsule stands for each part (capsules.py).
 At high fidelity the MJCF's own shapes collide.
 """
@@ -36,7 +36,7 @@ SIDES = ("left", "right")
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A robot on its way: its bodies stand in the spec, shapes and sensors do not."""
+    """A robot under construction: the spec has its bodies and joints, but no shapes and sensors."""
 
     spec: mujoco.MjSpec
     source: Source
@@ -112,15 +112,15 @@ def _derived(about: Description, model: mujoco.MjModel, high: bool) -> mujoco.Mj
     rig = _assemble(made, source)
     base = rig.body(rig.anatomy.base)
     base.add_light(**sun)
-    size = rig.stand_height / description.read("xbot_l").stand_height
-    base.add_site(name="torso_box", **{k: v * size for k, v in box.items()}, **_HIDDEN_BOX)
+    stand_height = about.stand_height or rig.stand_height
+    sizes = {field: share * stand_height for field, share in box.items()}
+    base.add_site(name="torso_box", **sizes, **_HIDDEN_BOX)
     base.add_site(name="imu", size=[0.01] * 3, group=4)
     _add_soles(rig, high)
     (_add_shapes if high else _add_capsules)(rig)
     _add_sensors(rig)
     _add_home(rig)
-    drop = about.sole_drop or _sole_drop(rig)
-    _finish(made, motors, high, about.stand_height or rig.stand_height, drop)
+    _finish(made, motors, high, stand_height, about.sole_drop or _sole_drop(rig))
     return made
 
 
@@ -130,15 +130,18 @@ _HIDDEN_BOX = {"type": mujoco.mjtGeom.mjGEOM_BOX, "rgba": [0, 0, 0, 0], "group":
 def _stage(name: str) -> tuple[mujoco.MjSpec, dict[str, object], dict[str, np.ndarray]]:
     """XBot-L's MJCF without the robot: floor, sky, camera, solver and classes of shapes.
 
-    Returns also XBot-L's light, and the place and half size [m] of its torso box.
+    Returns also XBot-L's light, and the place and half size of its torso box as shares of its
+    standing height. An episode ends when this box touches the ground.
     """
-    made = mujoco.MjSpec.from_file(str(description.read("xbot_l").mjcf))
+    xbot = description.read("xbot_l")
+    assert xbot.stand_height
+    made = mujoco.MjSpec.from_file(str(xbot.mjcf))
     lamp, box = made.lights[0], made.site("torso_box")
     fields = ("name", "mode", "type", "pos", "dir", "diffuse")
     sun = {
         field: np.copy(x) if hasattr(x := getattr(lamp, field), "shape") else x for field in fields
     }
-    place = {"pos": box.pos.copy(), "size": box.size.copy()}
+    place = {"pos": box.pos / xbot.stand_height, "size": box.size / xbot.stand_height}
     made.delete(made.worldbody.first_body())
     for leftover in (*made.keys, *made.numerics):
         made.delete(leftover)
@@ -181,7 +184,9 @@ def _add_capsules(rig: Rig) -> None:
     """Adds one capsule per part, and the contact pairs of training."""
     members = capsules.parts(rig.bare, rig.anatomy)
     clouds = {name: rig.points(bodies) for name, bodies in members.items()}
-    fitted = capsules.slim(capsules.fit_all(clouds))
+    wider = capsules.with_hips(rig.bare, rig.anatomy)
+    hips = {name: rig.points(bodies) for name, bodies in wider.items()}
+    fitted = capsules.slim(capsules.fit_all(clouds, hips))
     style = rig.spec.find_default("bumper")
     for name, capsule in fitted.items():
         body = members[name][0]
@@ -196,7 +201,7 @@ def _add_capsules(rig: Rig) -> None:
     free = [
         pair
         for pair in capsules.strangers(list(fitted))
-        if capsules.gap(*(fitted[name] for name in pair)) >= 0
+        if capsules.gap(fitted[pair[0]], fitted[pair[1]]) >= 0
     ]
     barred = {
         frozenset(map(capsules.geom_name, pair))

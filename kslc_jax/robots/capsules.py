@@ -19,6 +19,14 @@ THINNEST = 0.3
 """Least share of its radius that a capsule keeps where parts of different limbs are close."""
 
 
+THICKER = 1.5
+"""A thigh's capsule has the hip's shapes inside if it is not thicker by more than this factor.
+
+Otherwise the legs of a robot with wide hips would be apart where its hips are not."""
+
+_MIRROR = np.array([1.0, -1.0, 1.0])
+
+
 @dataclass(frozen=True, eq=False)
 class Capsule:
     """All points within `radius` of a segment, in the world at home [m]."""
@@ -47,6 +55,16 @@ def parts(model: mujoco.MjModel, anatomy: Anatomy) -> dict[str, list[int]]:
     return found
 
 
+def with_hips(model: mujoco.MjModel, anatomy: Anatomy) -> dict[str, list[int]]:
+    """Bodies of "left_thigh" and "right_thigh" and of the hips above them."""
+    found = {}
+    for side in ("left", "right"):
+        bodies = model.jnt_bodyid[1:][list(anatomy.limbs[f"{side}_leg"])].tolist()
+        knee = model.jnt_bodyid[1 + anatomy.roles[f"{side}_knee"]]
+        found[f"{side}_thigh"] = [body for body in bodies if body < knee]
+    return found
+
+
 def part(name: str) -> Part:
     """A part by its name: "left_shank" belongs to the left leg."""
     side, _, kind = name.partition("_")
@@ -59,24 +77,40 @@ def geom_name(name: str) -> str:
     return f"{name}_bumper"
 
 
-def fit_all(clouds: dict[str, np.ndarray]) -> dict[str, Capsule]:
+def fit_all(
+    clouds: dict[str, np.ndarray], wider: dict[str, np.ndarray] | None = None
+) -> dict[str, Capsule]:
     """A capsule per part, left and right ones mirror images of each other.
 
     Args:
       clouds: points [k, 3] on the surface of each part, world at home [m]. Parts without a point
         get no capsule.
+      wider: clouds that replace some of these, unless the capsule gets much thicker.
     """
-    mirror = np.array([1.0, -1.0, 1.0])
     fitted: dict[str, Capsule] = {}
-    for name, cloud in clouds.items():
-        twin = name.replace("left", "right") if "left" in name else name.replace("right", "left")
-        points = np.concatenate([cloud, clouds[twin] * mirror])
+    for name in clouds:
+        twin = _twin(name)
         if twin in fitted:
             left = fitted[twin]
-            fitted[name] = replace(left, start=left.start * mirror, end=left.end * mirror)
-        elif len(points):
-            fitted[name] = fit(points)
+            fitted[name] = replace(left, start=left.start * _MIRROR, end=left.end * _MIRROR)
+        elif len(both := _with_twin(clouds, name)):
+            fitted[name] = fit(both)
+            if wider and name in wider:
+                wide = fit(_with_twin(wider, name))
+                if wide.radius < THICKER * fitted[name].radius:
+                    fitted[name] = wide
     return fitted
+
+
+def _twin(name: str) -> str:
+    """The part on the other side; the trunk is its own."""
+    swap = ("left", "right") if "left" in name else ("right", "left")
+    return name.replace(*swap)
+
+
+def _with_twin(clouds: dict[str, np.ndarray], name: str) -> np.ndarray:
+    """Points of a part and mirrored points of its twin."""
+    return np.concatenate([clouds[name], clouds[_twin(name)] * _MIRROR])
 
 
 def fit(points: np.ndarray) -> Capsule:

@@ -15,6 +15,7 @@ import difflib
 import functools
 import importlib
 import importlib.util
+import math
 import os
 import re
 import tomllib
@@ -161,7 +162,7 @@ def _typed(path: Path, field: str, value: Any, kind: type, words: str) -> Any:
 
 
 def _number(path: Path, field: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or abs(value) == float("inf"):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise RobotError(f"{path}: {field} must be a number, not {value!r}")
     return float(value)
 

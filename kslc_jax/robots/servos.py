@@ -3,7 +3,7 @@
 import re
 from collections.abc import Iterable
 from dataclasses import asdict, replace
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import mujoco
 import numpy as np
@@ -112,5 +112,6 @@ def add_servos(spec: mujoco.MjSpec, motors: list[Motor], high: bool) -> None:
             name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT
         )
         servo.set_to_position(kp=motor.kp, kv=motor.kd)
-        servo.forcerange = [-motor.effort, motor.effort]
+        effort = cast(float, motor.effort)  # `motors` leaves no gap
+        servo.forcerange = [-effort, effort]
     spec.add_numeric(name="speed_limit", data=[motor.speed for motor in motors])
