@@ -100,7 +100,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         return self._observe(), reward, terminated, truncated, {}
 
     def simulate(self, target: np.ndarray) -> None:
-        """One control step of the physics towards the joint targets [16, rad]."""
+        """One control step of the physics towards the joint targets [n, rad]."""
         data, servos = self.data, self.model.actuator_biasprm
         for _ in range(self.config.physics.decimation):
             self.torque, data.ctrl[:], servos[:, motors.SERVO_DAMPING] = motors.drive(
@@ -137,7 +137,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         self.reference = leg * (left * min(s, 0.0) + right * max(s, 0.0))
 
     def _observe(self) -> Observation:
-        """Appends the present frames; returns copies of the histories [K, 59] and [Kp, 89]."""
+        """Appends the present frames; returns copies of the histories [K, W] and [Kp, W]."""
         joint_pos = self.data.qpos[7:] - self.robot.default_qpos[7:]
         joint_vel = self.data.qvel[6:]
         shared = [self.clock, self.command, joint_pos, joint_vel, self.action]

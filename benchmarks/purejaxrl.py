@@ -16,7 +16,7 @@ from kslc_jax.ppo import Learner, Samples
 from kslc_jax.train_step import Metrics, TrainState
 
 Stored = tuple[Samples, jax.Array, jax.Array]
-"""Samples, and the histories of actor and critic: [B, ...], [B, K, 59], [B, Kp, 89]."""
+"""Samples, and the histories of actor and critic: [B, ...], [B, K, W], [B, Kp, W]."""
 
 
 def make(

@@ -97,7 +97,7 @@ def check_engines() -> str:
 
 
 def _joint_angles(engine: Literal["mujoco", "mjx"]):
-    """Joint angles [16] after some control steps from standing."""
+    """Joint angles [n] after some control steps from standing."""
     import jax
     import jax.numpy as jnp
 

@@ -34,10 +34,10 @@ class EnvState:
     command: Command
     command_since: jax.Array  # [] int, `time` when the command was drawn
     command_until: jax.Array  # [] int, `time` when the next one is drawn
-    history: jax.Array  # [K, 59] actor frames, oldest first
-    privileged_history: jax.Array  # [Kp, 89] critic frames, oldest first
-    last_action: jax.Array  # [16] as applied
-    last_last_action: jax.Array  # [16]
+    history: jax.Array  # [K, W] actor frames, oldest first
+    privileged_history: jax.Array  # [Kp, W] critic frames, oldest first
+    last_action: jax.Array  # [n] as applied
+    last_last_action: jax.Array  # [n]
     last_base_velocity: jax.Array  # [6] world
     push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
     time: jax.Array  # [] int, control steps since the reset
@@ -104,7 +104,7 @@ def step(
     Args:
       config: static.
       state: the environment before the step.
-      action: [16] in joint order, unscaled.
+      action: [n] in joint order, unscaled.
       key: source of all randomness in this step.
       curriculum: present command range and gait cycle.
       simulate: the engine, with the signature of `physics.step`.

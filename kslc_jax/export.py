@@ -1,11 +1,11 @@
 """Takes a policy elsewhere: python -m kslc_jax.export POLICY policy.onnx
 
-Writes the network `history [batch, K, 59] -> action [batch, 16]` together with everything that a
+Writes the network `history [batch, K, W] -> action [batch, n]` together with everything that a
 robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. The robot's
-model, as MJCF without meshes, goes beside it: policy.xml. OUT ends in .onnx or .stablehlo (read back by jax.export; the data go beside it in OUT.json). The file is then
-compared with JAX over observations of the policy at work. With --format orbax OUT is a folder that
-`kslc_jax.load_policy` reads: config and actor-critic parameters, without the rest of a checkpoint.
-See docs/export.md.
+model goes beside it as an MJCF without meshes, policy.xml. OUT ends in .onnx or .stablehlo (read
+back by jax.export; the data go beside it in OUT.json). The file is then compared with JAX over
+observations of the policy at work. With --format orbax OUT is a folder that `kslc_jax.load_policy`
+reads: config and actor-critic parameters, without the rest of a checkpoint. See docs/export.md.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
-"""Histories [B, K, 59] to actions [B, 16]."""
+"""Histories [B, K, W] to actions [B, n]."""
 
 METADATA_VERSION = 3
 """Of the names and meanings in `metadata`; grows when one of them changes."""
@@ -271,7 +271,7 @@ READ = {"onnx": read_onnx, "stablehlo": read_stablehlo, "orbax": read_orbax}
 
 
 def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
-    """Histories [SAMPLES, K, 59] that the policy meets following commands of its own range."""
+    """Histories [SAMPLES, K, W] that the policy meets following commands of its own range."""
     import jax
 
     from kslc_jax import env

@@ -31,7 +31,7 @@ FRICTION_SPEED = 0.2
 
 
 def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
-    """PD torque within the motor's limits, minus joint friction [..., 16, N m].
+    """PD torque within the motor's limits, minus joint friction [..., n, N m].
 
     clip(kp (target - q) - kd dq, lower, upper). The full torque is effort_limit x motor_strength.
     In the driving direction the available torque is full up to 75 % of the joint's speed limit. It
@@ -41,7 +41,7 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
     Args:
       robot: gains and limits.
       dynamics: factors on gains and limits, see `Dynamics`.
-      q, dq, target: joint angles [rad], speeds [rad/s], target angles [rad], [..., 16].
+      q, dq, target: joint angles [rad], speeds [rad/s], target angles [rad], [..., n].
       xp: numpy or jax.numpy.
     """
     pd = dynamics.kp * robot.kp * (target - q) - dynamics.kd * robot.kd * dq
@@ -53,7 +53,7 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
 
 
 def motor_damping(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any = jnp):
-    """Damping [..., 16, N m s/rad] that the motors have over the next physics step.
+    """Damping [..., n, N m s/rad] that the motors have over the next physics step.
 
     It is `THETA` times the mean slope of `motor_torque`, from the present speed and `torque` to the
     expected speed at the end of the step. A joint alone then moves by the theta-method.
@@ -68,7 +68,7 @@ def motor_damping(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any = 
 
 
 def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
-    """Joint speed [..., 16, rad/s] at the end of the step if each joint moved alone.
+    """Joint speed [..., n, rad/s] at the end of the step if each joint moved alone.
 
     Solves v = dq + h / inertia ((1 - theta) torque + theta torque(v)) with `robot.joint_inertia`.
     torque(v) leaves out joint friction. It is a clip of linear pieces. Each piece has one solution.
@@ -90,12 +90,12 @@ def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
 
 
 def servo_control(robot: Robot, torque, damping, q, dq):
-    """Control [..., 16] that makes the servos' kp (ctrl - q) - damping dq equal to `torque`."""
+    """Control [..., n] that makes the servos' kp (ctrl - q) - damping dq equal to `torque`."""
     return q + (torque + damping * dq) / robot.kp
 
 
 def drive(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
-    """(motor torque, servo control, servo bias on joint speed) of one physics step, each [..., 16].
+    """(motor torque, servo control, servo bias on joint speed) of one physics step, each [..., n].
 
     Write the bias to `actuator_biasprm[..., SERVO_DAMPING]`.
     """

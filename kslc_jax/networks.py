@@ -18,7 +18,7 @@ from kslc_jax.config import Config
 from kslc_jax.robot import Robot
 
 Params = dict[str, Any]
-"""{'actor': flax params, 'critic': flax params, 'log_std': [16]}, and 'estimator': flax params if
+"""{'actor': flax params, 'critic': flax params, 'log_std': [n]}, and 'estimator': flax params if
 the config has one."""
 
 ACTING = ("actor", "estimator", "log_std")
@@ -117,15 +117,15 @@ def _flat(frames: jax.Array) -> jax.Array:
 class Gaussian:
     """Diagonal Gaussian over actions."""
 
-    mean: jax.Array  # [..., 16]
-    log_std: jax.Array  # [16]
+    mean: jax.Array  # [..., n]
+    log_std: jax.Array  # [n]
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """One action [..., 16]."""
+        """One action [..., n]."""
         return self.mean + jnp.exp(self.log_std) * jax.random.normal(key, self.mean.shape)
 
     def log_prob(self, action: jax.Array) -> jax.Array:
-        """Log density of `action` [..., 16], summed over its components."""
+        """Log density of `action` [..., n], summed over its components."""
         z = (action - self.mean) * jnp.exp(-self.log_std)
         return jnp.sum(-0.5 * jnp.square(z) - self.log_std - 0.5 * _LOG_2PI, axis=-1)
 
@@ -204,14 +204,14 @@ def init(config: Config, key: jax.Array) -> Params:
 
 
 def policy(config: Config, params: Params, history: jax.Array) -> Gaussian:
-    """Action distribution for actor histories [..., K, 59]."""
+    """Action distribution for actor histories [..., K, W]."""
     return policy_and_estimate(config, params, history)[0]
 
 
 def policy_and_estimate(
     config: Config, params: Params, history: jax.Array
 ) -> tuple[Gaussian, jax.Array | None]:
-    """(action distribution, estimated base velocity [..., 3]) for actor histories [..., K, 59].
+    """(action distribution, estimated base velocity [..., 3]) for actor histories [..., K, W].
 
     The estimate is scaled as in the critic's frame; it is None without an estimator. No gradient
     flows from the actor into the estimator.
@@ -226,7 +226,7 @@ def policy_and_estimate(
 
 
 def log_std(config: Config, params: Params) -> jax.Array:
-    """Log standard deviation [16] of the policy; equal on both sides if it is symmetric."""
+    """Log standard deviation [n] of the policy; equal on both sides if it is symmetric."""
     free = params["log_std"]
     if not config.network.symmetric:
         return free
@@ -234,6 +234,6 @@ def log_std(config: Config, params: Params) -> jax.Array:
 
 
 def value(config: Config, params: Params, privileged: jax.Array) -> jax.Array:
-    """State value [...] for critic histories [..., Kp, 89]."""
+    """State value [...] for critic histories [..., Kp, W]."""
     out = cast(jax.Array, _critic(config).apply({"params": params["critic"]}, privileged))
     return out[..., 0]

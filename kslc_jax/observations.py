@@ -122,8 +122,8 @@ class Sources:
     gait: GaitState
     command: Command
     dynamics: Dynamics
-    reference: jax.Array  # [16] rad
-    last_action: jax.Array  # [16]
+    reference: jax.Array  # [n] rad
+    last_action: jax.Array  # [n]
     push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
     base_mass: jax.Array  # [] kg, mass of the trunk
 

@@ -39,13 +39,13 @@ from kslc_jax.robot import Robot
 class PhysicsState:
     """Physics of one environment. The next control step and all signals are computed from it."""
 
-    qpos: jax.Array  # [23] base position [m], base quaternion (w, x, y, z), joint angles [rad]
+    qpos: jax.Array  # [7 + n] base position [m], base quaternion (w, x, y, z), joint angles [rad]
     qvel: (
         jax.Array
-    )  # [22] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
-    qacc_warmstart: jax.Array  # [22] start of the contact solver
+    )  # [6 + n] base velocity, world [m/s]; base rate, body frame [rad/s]; joints [rad/s]
+    qacc_warmstart: jax.Array  # [6 + n] start of the contact solver
     sensordata: jax.Array  # [S] named sensors of the model, see Robot.sensor
-    torque: jax.Array  # [16] motor torque minus joint friction, last physics step [N m]
+    torque: jax.Array  # [n] motor torque minus joint friction, last physics step [N m]
 
 
 def robot_for(config: PhysicsConfig) -> Robot:
@@ -87,14 +87,14 @@ def step(
     force: jax.Array | None = None,
     alter: Callable[[dict[str, jax.Array]], dict[str, jax.Array]] | None = None,
 ) -> PhysicsState:
-    """Advances one environment by one control step towards the joint targets [16, rad].
+    """Advances one environment by one control step towards the joint targets [n, rad].
 
     The new state has the dtypes of the old one, also in a program that enables x64.
 
     Args:
       config: engine and solver.
       state: before the step.
-      target: joint angles [16, rad].
+      target: joint angles [n, rad].
       dynamics: how this robot differs from the described one.
       ground_friction: see `model_fields`.
       force: [nbody, 6] force [N] and torque [N m] on each body at its centre of mass, world frame.

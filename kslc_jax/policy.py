@@ -39,7 +39,7 @@ POLICIES = Path(__file__).parent / "policies"
 class PolicyState:
     """Memory of a running policy."""
 
-    history: jax.Array  # [K, 59]
+    history: jax.Array  # [K, W]
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class Policy:
         return PolicyState(jnp.zeros((self.config.env.frames, width)))
 
     def act(self, state: PolicyState, frame: jax.Array) -> tuple[PolicyState, jax.Array]:
-        """Deterministic action [16] for the newest actor frame [59]."""
+        """Deterministic action [n] for the newest actor frame [W]."""
         history = observations.append_frame(state.history, frame)
         return PolicyState(history), self.act_on(history)
 
     def act_on(self, history: jax.Array) -> jax.Array:
-        """Deterministic action [16] for a whole history [K, 59]."""
+        """Deterministic action [n] for a whole history [K, W]."""
         return networks.policy(self.config, self.params, history).mean
 
 

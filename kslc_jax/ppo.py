@@ -34,8 +34,8 @@ class Samples:
     """Data of each rollout step for PPO, with leading axes [T, N] or others."""
 
     index: jax.Array  # [] int, index of the observation, see the module docstring
-    action: jax.Array  # [16]
-    mean: jax.Array  # [16] of the policy that acted
+    action: jax.Array  # [n]
+    mean: jax.Array  # [n] of the policy that acted
     log_prob: jax.Array  # [] of the action, under that policy
     value: jax.Array  # [] of the critic at the rollout
     advantage: jax.Array  # []
@@ -47,7 +47,7 @@ class Samples:
 class RolloutConstants:
     """Values that all samples of a rollout share."""
 
-    log_std: jax.Array  # [16] of the policy that acted
+    log_std: jax.Array  # [n] of the policy that acted
     entropy_coef: jax.Array  # [] weight of the entropy bonus in the update
 
 

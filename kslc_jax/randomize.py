@@ -18,12 +18,12 @@ class Dynamics:
     friction: jax.Array  # [] sliding friction of the feet, not yet averaged with the ground
     base_mass: jax.Array  # [] kg added to the trunk
     base_com: jax.Array  # [3] m, shift of the trunk's centre of mass, trunk frame
-    kp: jax.Array  # [16] factor on the position gain
-    kd: jax.Array  # [16] factor on the velocity gain
-    motor_strength: jax.Array  # [16] factor on the available torque
-    joint_friction: jax.Array  # [16] N m
-    link_mass: jax.Array  # [17] factor on mass and inertia, order of robot.link_body_ids
-    link_com: jax.Array  # [17, 3] m, shift of the centre of mass, link frame, same order
+    kp: jax.Array  # [n] factor on the position gain
+    kd: jax.Array  # [n] factor on the velocity gain
+    motor_strength: jax.Array  # [n] factor on the available torque
+    joint_friction: jax.Array  # [n] N m
+    link_mass: jax.Array  # [1 + n] factor on mass and inertia, order of robot.link_body_ids
+    link_com: jax.Array  # [1 + n, 3] m, shift of the centre of mass, link frame, same order
     hand_mass: jax.Array  # [] kg added to the last link of each arm
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
 

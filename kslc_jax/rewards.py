@@ -26,11 +26,11 @@ class Inputs:
     signals: Signals
     gait: GaitState
     command: Command
-    reference: jax.Array  # [16] rad
-    action: jax.Array  # [16] as applied: delayed and noisy
-    last_action: jax.Array  # [16]
-    last_last_action: jax.Array  # [16]
-    last_joint_vel: jax.Array  # [16] rad/s
+    reference: jax.Array  # [n] rad
+    action: jax.Array  # [n] as applied: delayed and noisy
+    last_action: jax.Array  # [n]
+    last_last_action: jax.Array  # [n]
+    last_joint_vel: jax.Array  # [n] rad/s
     last_base_velocity: jax.Array  # [6] world, m/s and rad/s
     v_max: jax.Array  # [] m/s, upper end of the commanded range
 

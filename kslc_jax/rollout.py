@@ -22,13 +22,13 @@ from kslc_jax.physics import PhysicsState
 class Trajectory:
     """One rollout, [T, N, ...]. Each frame is stored once; the update gathers windows of them."""
 
-    action: jax.Array  # [T, N, 16]
-    mean: jax.Array  # [T, N, 16]
+    action: jax.Array  # [T, N, n]
+    mean: jax.Array  # [T, N, n]
     log_prob: jax.Array  # [T, N]
     value: jax.Array  # [T, N]
     age: jax.Array  # [T, N] int, control steps since the reset, before the step
-    frame: jax.Array  # [T, N, 59] newest actor frame, before the step
-    privileged: jax.Array  # [T, N, 89] newest critic frame, before the step
+    frame: jax.Array  # [T, N, W] newest actor frame, before the step
+    privileged: jax.Array  # [T, N, W] newest critic frame, before the step
     outcome: Outcome  # [T, N]
 
 

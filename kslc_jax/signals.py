@@ -21,8 +21,8 @@ class Signals:
     """Physical quantities of one environment at one instant. Feet and knees: left, right."""
 
     joint_pos: jax.Array  # [n] rad, from the home pose
-    joint_vel: jax.Array  # [16] rad/s
-    torque: jax.Array  # [16] N m
+    joint_vel: jax.Array  # [n] rad/s
+    torque: jax.Array  # [n] N m
     base_pos: jax.Array  # [3] m, world
     base_euler: jax.Array  # [3] roll, pitch, yaw [rad]
     base_linvel: jax.Array  # [3] m/s, base frame

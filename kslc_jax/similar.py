@@ -8,7 +8,6 @@ l = m = 1, and its presets stay as they are. docs/own_robot.md explains each rul
 
 import dataclasses
 import math
-import operator
 from functools import reduce
 from typing import Any
 
@@ -38,21 +37,17 @@ def preset(name: str, robot: str = robot_lib.XBOT_L, without: tuple[str, ...] = 
     where = robot if robot in description.known() else str(about.path)
     physics = dataclasses.replace(config.physics, robot=where)
     config = scaled(dataclasses.replace(config, physics=physics), robot_lib.load(name=where))
-    for field, value in about.config:
-        config = _replaced(config, field, value, f"{about.path}: config")
-    return config
+    return _changed(config, dict(about.config), f"{about.path}: config")
 
 
 def scaled(config: Config, robot: Robot) -> Config:
     """A config for XBot-L, scaled to another robot."""
     changes = {
-        field: _times(_get(config, field), factor)
+        field: _times(reduce(getattr, field.split("."), config), factor)
         for field, factor in factors(robot).items()
         if factor != 1.0
     }
-    for field, value in changes.items():
-        config = _replaced(config, field, value, "scaled")
-    return config
+    return _changed(config, changes, "scaled")
 
 
 def factors(robot: Robot) -> dict[str, float]:
@@ -113,23 +108,32 @@ def _times(value: Any, factor: float) -> Any:
     return float(f"{value * factor:.{DIGITS}g}") if abs(value) < 1e8 else value  # 1e9: switched off
 
 
-def _get(config: Config, field: str) -> Any:
-    return reduce(getattr, field.split("."), config)
-
-
-def _replaced(config: Any, field: str, value: Any, where: str) -> Any:
-    """The config with another value of a dotted field."""
-    name, _, rest = field.partition(".")
+def _changed(config: Any, changes: dict[str, Any], where: str) -> Any:
+    """The config with other values of fields, by their dotted names. All change at once, because
+    checks compare fields with each other."""
+    inside: dict[str, dict[str, Any]] = {}
+    for field, value in changes.items():
+        name, _, rest = field.partition(".")
+        inside.setdefault(name, {})[rest] = value
     names = [f.name for f in dataclasses.fields(config)]
-    if name not in names:
-        raise ConfigError(f"{where}: unknown field {name!r}; there are {', '.join(names)}")
-    old = operator.attrgetter(name)(config)
-    if rest:
-        if not dataclasses.is_dataclass(old):
-            raise ConfigError(f"{where}: {name!r} has no field {rest!r}")
-        return dataclasses.replace(config, **{name: _replaced(old, rest, value, where)})
-    if isinstance(old, float) and isinstance(value, int) and not isinstance(value, bool):
+    new = {}
+    for name, parts in inside.items():
+        if name not in names:
+            raise ConfigError(f"{where}: unknown field {name!r}; there are {', '.join(names)}")
+        old = getattr(config, name)
+        if "" in parts:
+            new[name] = _checked(old, parts[""], f"{where}: {name}")
+        elif dataclasses.is_dataclass(old):
+            new[name] = _changed(old, parts, where)
+        else:
+            raise ConfigError(f"{where}: {name!r} has no field {next(iter(parts))!r}")
+    return dataclasses.replace(config, **new)
+
+
+def _checked(old: Any, value: Any, where: str) -> Any:
+    """The new value of a field, of the type of the old one."""
+    if isinstance(old, float) and type(value) is int:
         value = float(value)
-    if type(value) is not type(old):
-        raise ConfigError(f"{where}: {name}: {value!r} is not a valid value")
-    return dataclasses.replace(config, **{name: value})
+    if type(value) is not type(old) or dataclasses.is_dataclass(old):
+        raise ConfigError(f"{where}: {value!r} is not a valid value")
+    return value

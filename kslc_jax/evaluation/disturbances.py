@@ -40,7 +40,7 @@ def punch(robot: Robot, newtons: float, key: jax.Array, steps: jax.Array, dt: fl
 def walk_arms(
     robot: Robot, targets: jax.Array, key: jax.Array, steps: jax.Array, dt: float
 ) -> jax.Array:
-    """Joint targets [16, rad] one control step later: each moves at a random speed up to
+    """Joint targets [n, rad] one control step later: each moves at a random speed up to
     `ARM_RATE`, drawn anew every `ARM_SECONDS`, within the joint's limits."""
     interval = jax.random.fold_in(key, steps // round(ARM_SECONDS / dt))
     rate = jax.random.uniform(interval, targets.shape, minval=-ARM_RATE, maxval=ARM_RATE)

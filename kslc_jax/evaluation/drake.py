@@ -78,8 +78,8 @@ class World:
     plant: MultibodyPlant
     context: Context  # of the diagram
     feet: tuple[GeometryId, ...]  # left and right
-    q_index: np.ndarray  # [23] index in Drake's positions of each element of qpos
-    v_index: np.ndarray  # [22] index in Drake's velocities of each element of qvel
+    q_index: np.ndarray  # [7 + n] index in Drake's positions of each element of qpos
+    v_index: np.ndarray  # [6 + n] index in Drake's velocities of each element of qvel
 
     @property
     def plant_context(self) -> Context:
@@ -239,7 +239,7 @@ def _exclude(plant: MultibodyPlant, scene: SceneGraph, model: mujoco.MjModel) ->
 
 
 def set_state(world: World, qpos: np.ndarray, qvel: np.ndarray) -> None:
-    """Puts the robot at `qpos` [23] with `qvel` [22], in MuJoCo's conventions."""
+    """Puts the robot at `qpos` [7 + n] with `qvel` [6 + n], in MuJoCo's conventions."""
     q, v = np.empty(len(qpos)), np.empty(len(qvel))
     rate = np.empty(3)
     mujoco.mju_rotVecQuat(rate, qvel[3:6], qpos[3:7])
@@ -248,7 +248,7 @@ def set_state(world: World, qpos: np.ndarray, qvel: np.ndarray) -> None:
 
 
 def get_state(world: World) -> tuple[np.ndarray, np.ndarray]:
-    """The robot's qpos [23] and qvel [22] in MuJoCo's conventions."""
+    """The robot's qpos [7 + n] and qvel [6 + n] in MuJoCo's conventions."""
     qpos = world.plant.GetPositions(world.plant_context)[world.q_index]
     qvel = world.plant.GetVelocities(world.plant_context)[world.v_index]
     mujoco.mju_normalize4(qpos[3:7])
@@ -259,7 +259,7 @@ def get_state(world: World) -> tuple[np.ndarray, np.ndarray]:
 def advance(
     world: World, state: PhysicsState, target: np.ndarray, dynamics: Dynamics, steps: int
 ) -> PhysicsState:
-    """Does `steps` physics steps of one robot towards `target` [16, rad]; numpy in, numpy out.
+    """Does `steps` physics steps of one robot towards `target` [n, rad]; numpy in, numpy out.
 
     If Drake fails in a step, qpos and qvel are NaN, like those of a diverged step in MuJoCo.
     """

@@ -72,12 +72,12 @@ class Trace:
 
     alive: jax.Array  # bool
     mass: jax.Array  # kg, of the robot and what it carries
-    qpos: jax.Array  # [23]
+    qpos: jax.Array  # [7 + n]
     linvel: jax.Array  # [3] m/s, base frame
     angvel: jax.Array  # [3] rad/s, base frame
     euler: jax.Array  # [3] rad
-    joint_vel: jax.Array  # [16] rad/s
-    torque: jax.Array  # [16] N m
+    joint_vel: jax.Array  # [n] rad/s
+    torque: jax.Array  # [n] N m
     contact: jax.Array  # [2] bool, left and right foot
     foot_height: jax.Array  # [2] m, ankle-roll link
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
@@ -91,9 +91,9 @@ class Trial:
 
     env: env.EnvState
     alive: jax.Array  # [] bool
-    queue: jax.Array  # [latency, 16] actions that are still to come, the next one first
+    queue: jax.Array  # [latency, n] actions that are still to come, the next one first
     leg: Leg
-    arms: jax.Array  # [16] rad, targets of held arms
+    arms: jax.Array  # [n] rad, targets of held arms
     body: Body
     key: jax.Array  # the robot's own
     steps: jax.Array  # [] int, control steps done

@@ -28,8 +28,8 @@ Fields = dict[str, jax.Array]
 class Body:
     """How one robot differs."""
 
-    friction: jax.Array  # [16] N m
-    damping: jax.Array  # [16] N m s/rad
+    friction: jax.Array  # [n] N m
+    damping: jax.Array  # [n] N m s/rad
 
 
 def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:

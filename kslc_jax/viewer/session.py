@@ -46,7 +46,7 @@ def steady(velocity: np.ndarray, walks: bool, dead_zone: float) -> tuple[np.ndar
 class View:
     """The values of one control step that the viewer shows. Feet: left, right."""
 
-    qpos: jax.Array  # [23]
+    qpos: jax.Array  # [7 + n]
     command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
     velocity: jax.Array  # [3] actual vx, vy [m/s], yaw rate [rad/s]; base frame
     phase: jax.Array  # [] share of the gait cycle

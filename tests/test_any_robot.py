@@ -1,0 +1,302 @@
+"""The package with another robot: the biped of tests/data, without arms and with other names."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from states import XBOT
+
+from kslc_jax import (
+    checkpoint_format,
+    config,
+    curriculum,
+    env,
+    export,
+    gait,
+    networks,
+    observations,
+    physics,
+    policy,
+    randomize,
+    rewards,
+    robot,
+    signals,
+    similar,
+    train,
+    train_step,
+)
+from kslc_jax.commands import Command
+from kslc_jax.evaluation import gait_metrics, trials
+from kslc_jax.robots.description import RobotError
+
+BIPED = str(Path(__file__).parent / "data" / "biped.toml")
+ENVS = 3
+
+
+@pytest.fixture(scope="module")
+def biped() -> robot.Robot:
+    return robot.load(name=BIPED)
+
+
+@pytest.fixture(scope="module")
+def setup() -> config.Config:
+    """Debug preset for the biped, without noise."""
+    made = similar.preset("debug", BIPED)
+    quiet = dataclasses.replace(
+        made.env, num_envs=ENVS, noise_level=0.0, action_delay=0.0, action_noise=0.0
+    )
+    quiet = dataclasses.replace(quiet, reset_joint_noise=0.0)
+    return dataclasses.replace(
+        made, env=quiet, physics=dataclasses.replace(made.physics, engine="mujoco")
+    )
+
+
+@pytest.fixture(scope="module")
+def untrained(setup) -> policy.Policy:
+    params = networks.init(setup, jax.random.key(0))
+    return policy.Policy(setup, params, curriculum.init(setup), 0)
+
+
+# ------------------------------------------------------------------------------------- similarity
+
+
+@pytest.mark.parametrize("name", config.PRESETS)
+def test_presets_of_xbot_l_stay_as_they_are(name):
+    assert similar.factors(XBOT).keys() and set(similar.factors(XBOT).values()) == {1.0}
+    assert similar.preset(name) == config.preset(name)
+
+
+def test_a_quarter_of_the_height_and_an_eighth_of_the_mass():
+    """By hand: times and speeds halve, torques are 1/32, momenta 1/64."""
+    small = dataclasses.replace(XBOT, length_ratio=0.25, mass_ratio=0.125)
+    laptop = config.preset("laptop")
+    c = similar.scaled(laptop, small)
+    assert (c.curriculum.v_limit, c.gait.cycle_time, c.curriculum.cycle_min) == (2.25, 0.32, 0.19)
+    assert c.command.vy == (-0.15, 0.15) and c.randomize.base_mass == (-0.625, 0.625)
+    assert c.rewards.momentum_scale == pytest.approx(2.0 / 64, rel=1e-2)  # three digits
+    assert c.rewards.base_height_target == pytest.approx(0.2225, rel=1e-2)
+    assert c.rewards.weights.torques == pytest.approx(-1e-5 * 32**2, rel=1e-2)
+    assert c.rewards.weights.dof_acc == pytest.approx(-3e-7 / 16, rel=1e-2)
+    assert c.rewards.weights.action_smoothness == laptop.rewards.weights.action_smoothness
+    assert c.rewards.feet_distance == laptop.rewards.feet_distance  # of the same shape
+    paper = similar.scaled(config.preset("paper"), small)
+    assert paper.curriculum.top_error == 1e9  # what is switched off stays so
+
+
+def test_sums_over_joints_scale_with_their_number(biped):
+    c, factors = config.preset("laptop"), similar.factors(biped)
+    assert biped.count == 9
+    assert factors["rewards.weights.action_smoothness"] == 16 / 9
+    assert factors["rewards.joint_pos_kernel"] == pytest.approx(4 / 3)
+    assert similar.scaled(c, biped).rewards.joint_pos_clip == pytest.approx(0.375)
+    assert factors["rewards.knee_distance"] == pytest.approx(0.2 / XBOT.knees_apart)
+
+
+def test_a_description_overrides_the_scaled_config(tmp_path):
+    def described(line: str) -> str:
+        text = Path(BIPED).read_text().replace("biped.xml", BIPED.replace(".toml", ".xml"))
+        path = tmp_path / f"{abs(hash(line))}.toml"
+        path.write_text(f"{text}\n[config]\n{line}\n")
+        return str(path)
+
+    c = similar.preset("laptop", described('"gait.reference_scale" = 0.2'))
+    assert c.gait.reference_scale == 0.2 and c.curriculum.v_limit < 4.5
+    for line, says in (
+        ('"gait.reference" = 0.2', "unknown field 'reference'"),
+        ('"gait.reference_scale" = "much"', "'much' is not a valid value"),
+        ('"gait.reference_scale.left" = 1', "has no field 'left'"),
+    ):
+        with pytest.raises(config.ConfigError, match=says):
+            similar.preset("laptop", described(line))
+
+
+def test_too_little_of_the_trunk_is_an_error(biped):
+    """The biped's trunk weighs 6 kg: it cannot give away 6."""
+    with pytest.raises(config.ConfigError, match=r"-6 kg leave 0\.0 of the trunk's 6\.0"):
+        randomize.sample(config.RandomizeConfig(base_mass=(-6.0, 0.0)), biped, jax.random.key(0))
+
+
+# ---------------------------------------------------------------------------------- one robot
+
+
+def command(vx: float) -> Command:
+    velocity = jnp.array([vx, 0.0, 0.0])
+    return Command(velocity=velocity, heading=jnp.zeros(()), moving=jnp.ones((), bool))
+
+
+def test_widths_follow_from_the_number_of_joints(biped, setup):
+    assert observations.actor_width(biped) == 11 + 3 * 9
+    assert observations.critic_width(biped) == 25 + 4 * 9
+    state = env.reset(setup, jax.random.key(0), curriculum.init(setup))
+    assert state.history.shape == (3, 38) and state.privileged_history.shape[-1] == 61
+    assert state.last_action.shape == (9,) and state.dynamics.link_mass.shape == (10,)
+
+
+def test_joint_angles_count_from_home(biped, setup):
+    home = jnp.asarray(biped.default_qpos, jnp.float32)
+    state = physics.initial_state(setup.physics, home, jnp.zeros(15))
+    now = signals.read(biped, state)
+    assert (
+        float(jnp.max(jnp.abs(now.joint_pos))) == 0.0 and np.abs(biped.default_qpos[7:]).max() > 0.2
+    )
+    assert float(now.foot_pos[0, 1] - now.foot_pos[1, 1]) == pytest.approx(0.2, abs=1e-5)
+
+
+def reference(biped, setup, phase: float) -> np.ndarray:
+    """Reference joint angles from home, at this phase and half of the full speed."""
+    still = command(0.5 * setup.gait.full_speed)
+    clock, stance = gait._clock(setup.gait, jnp.asarray(phase), still)
+    state = gait.init(setup.gait, jax.random.key(0), still, jnp.zeros(2))
+    state = state.replace(clock=clock, stance=stance)
+    return np.asarray(gait.reference_pose(setup.gait, biped, state, still))
+
+
+def feet_of(biped, angles: np.ndarray) -> np.ndarray:
+    """[2, 3] position of the feet at these angles from home; the base stays where it is."""
+    data = mujoco.MjData(biped.mj_model)
+    data.qpos[:] = biped.default_qpos
+    data.qpos[7:] += angles
+    mujoco.mj_kinematics(biped.mj_model, data)
+    return data.xpos[list(biped.anatomy.feet)].copy()
+
+
+def test_the_reference_swings_one_foot_forward_and_up_and_then_the_other(biped, setup):
+    rest = feet_of(biped, np.zeros(9))
+    permutation, sign = biped.anatomy.permutation, biped.anatomy.sign
+    for phase, swings, stands in ((0.25, 1, 0), (0.75, 0, 1)):
+        angles = reference(biped, setup, phase)
+        moved = feet_of(biped, angles) - rest
+        assert moved[swings, 2] > 0.03 and abs(moved[stands, 2]) < 0.01
+        other = reference(biped, setup, phase + 0.5)
+        np.testing.assert_allclose(other, angles[permutation] * sign, atol=1e-5)
+    lower, upper = biped.reference_range
+    for phase in np.linspace(0, 1, 21):
+        angles = reference(biped, setup, phase)
+        assert np.all(angles >= lower - 1e-6) and np.all(angles <= upper + 1e-6)
+
+
+def test_a_robot_without_yaw_has_its_roll_in_the_posture_term(biped):
+    assert biped.roll_and_yaw("left") == [1] and biped.roll_and_yaw("right") == [5]
+    assert XBOT.roll_and_yaw("right") == [6, 7]
+
+
+def mirrored_state(biped, state: physics.PhysicsState) -> physics.PhysicsState:
+    """The state of the mirrored robot: y, and rotations about x and z, change sign."""
+    permutation, sign = biped.anatomy.permutation, biped.anatomy.sign
+    qpos, qvel = np.asarray(state.qpos).copy(), np.asarray(state.qvel).copy()
+    qpos[:7] *= [1, -1, 1, 1, -1, 1, -1]
+    qvel[:6] *= [1, -1, 1, -1, 1, -1]
+    qpos[7:], qvel[6:] = qpos[7:][permutation] * sign, qvel[6:][permutation] * sign
+    return state.replace(qpos=jnp.asarray(qpos), qvel=jnp.asarray(qvel))
+
+
+def test_the_mirrored_robot_moves_as_the_mirror_image(biped, setup):
+    """0.2 s on the floor: model, soles, servos and mirror map are symmetric."""
+    permutation, sign = biped.anatomy.permutation, biped.anatomy.sign
+    home = jnp.asarray(biped.default_qpos, jnp.float32).at[2].add(-0.05)
+    rng = np.random.default_rng(0)
+    push = jnp.asarray(rng.normal(0, 0.3, 15), jnp.float32)
+    here = physics.initial_state(setup.physics, home, push)
+    there = mirrored_state(biped, here)
+    target = home[7:] + jnp.asarray(rng.normal(0, 0.2, 9), jnp.float32)
+    other = target[permutation] * sign
+    step = jax.jit(lambda s, t: physics.step(setup.physics, s, t, randomize.nominal(biped), 1.0))
+    for _ in range(20):
+        here, there = step(here, target), step(there, other)
+    np.testing.assert_allclose(there.qpos, mirrored_state(biped, here).qpos, atol=2e-4)
+
+
+def test_every_reward_term_is_finite_and_the_episode_goes_on(biped, setup):
+    start = curriculum.init(setup)
+    state = env.reset(setup, jax.random.key(0), start)
+    new, out = jax.jit(lambda s: env.step(setup, s, jnp.zeros(9), jax.random.key(1), start))(state)
+    assert out.terms.keys() == rewards.TERMS.keys()
+    assert all(np.isfinite(value) for value in out.terms.values())
+    assert not bool(out.terminated) and int(new.time) == 1
+
+
+def test_the_actor_of_a_mirrored_history_gives_the_mirrored_action(biped, untrained):
+    table = observations.actor_table(biped)
+    at, factor = observations.mirror_map(table, biped)
+    history = jax.random.normal(jax.random.key(1), untrained.init().history.shape)
+    there = untrained.act_on(history[:, at] * factor)
+    permutation, sign = biped.anatomy.permutation, biped.anatomy.sign
+    np.testing.assert_allclose(there, untrained.act_on(history)[permutation] * sign, atol=1e-6)
+
+
+def test_the_train_step_has_consistent_shapes(setup):
+    state = jax.eval_shape(lambda: train_step.init(setup, 0))
+    new, _ = jax.eval_shape(lambda s: train_step.step(setup, s), state)
+    assert jax.tree.map(lambda x: x.shape, new) == jax.tree.map(lambda x: x.shape, state)
+
+
+# ----------------------------------------------------------------------------- trials and policies
+
+
+def test_a_trial_at_high_fidelity_has_all_metrics_but_those_of_arms(biped, untrained):
+    setting = trials.Setting(trials.engine(untrained, "high"), seconds=1.0)
+    assert setting.physics.robot == BIPED
+    trace = trials.join(list(trials.run(untrained, setting, np.zeros((2, 3)))))
+    assert trace.qpos.shape == (100, 2, 16) and trace.mass[0, 0] == pytest.approx(biped.total_mass)
+    trace = trace.replace(alive=np.ones_like(trace.alive))
+    longer = trials.join([trace] * 3)  # metrics begin after two seconds
+    found = gait_metrics.summary(longer, 0.0, physics.robot_for(setting.physics), 0.01)
+    assert {"knee_range_difference", "legs_momentum_rms", "stance_difference"} <= found.keys()
+    assert not any("arm" in name or "shoulder" in name for name in found)
+
+
+def test_a_policy_knows_its_robot(untrained, tmp_path):
+    policy.save_policy(untrained, tmp_path / "policy")
+    loaded = policy.load_policy(tmp_path / "policy")
+    assert loaded.config.physics.robot == BIPED
+    history = jnp.ones(untrained.init().history.shape)
+    np.testing.assert_array_equal(loaded.act_on(history), untrained.act_on(history))
+    ours = checkpoint_format.metadata(untrained.config, {}, {})
+    theirs = checkpoint_format.metadata(config.preset("debug"), {}, {})
+    ours["robot"] = theirs["robot"]
+    del ours["checksums"]
+    with pytest.raises(checkpoint_format.CheckpointError, match=r"another robot.*not of biped"):
+        checkpoint_format.checked_metadata(ours, whole=False)
+
+
+def test_the_exported_model_is_the_robots(biped, untrained):
+    again = mujoco.MjModel.from_xml_string(export.mjcf(untrained))
+    np.testing.assert_allclose(again.body_mass, biped.mj_model.body_mass, rtol=1e-5)
+    np.testing.assert_allclose(again.actuator_gainprm[:, 0], biped.kp)
+    assert [again.actuator(i).name for i in range(again.nu)] == list(biped.joint_names)
+    data = export.metadata(untrained)
+    np.testing.assert_allclose(data["default_joint_pos"], biped.default_qpos[7:])
+    assert sum(c["width"] for c in data["frame"]) == 38
+
+
+# --------------------------------------------------------------------------------- command line
+
+
+def test_the_command_line_takes_a_robot():
+    args = train.parse(["--robot", BIPED, "--preset", "debug"])
+    assert args.config == similar.preset("debug", BIPED)
+    assert str(train.headline(args)[1]) == "runs/biped-debug-seed0"
+    with pytest.raises(RobotError, match=r"unknown robot 'unitree_g2' \(closest: unitree_g1\)"):
+        train.parse(["--robot", "unitree_g2"])
+
+
+def test_help_knows_the_robot():
+    """Its numbers are the defaults that the help shows."""
+    asked = [sys.executable, "-m", "kslc_jax.train", "--robot", BIPED, "--help"]
+    done = subprocess.run(asked, capture_output=True, text=True, check=True)
+    shown = similar.preset("laptop", BIPED).rewards.base_height_target
+    assert f"{shown:g}" in done.stdout
+
+
+@pytest.mark.slow(reason="compiles a train step: a minute")
+def test_the_biped_trains_and_resumes(tmp_path):
+    run = ["--run-dir", str(tmp_path), "--steps"]
+    assert train.main(["--robot", BIPED, "--preset", "debug", *run, "256"]) == 0
+    assert train.main(["--resume", *run, "512"]) == 0
+    assert policy.load_policy(tmp_path).step == 4
