@@ -294,6 +294,14 @@ def test_help_knows_the_robot():
     assert f"{shown:g}" in done.stdout
 
 
+def test_a_training_does_not_start_from_another_robots_policy(tmp_path, capsys):
+    """Nor does the check of it take a compilation."""
+    given = ["--start-from", "xbot_l_run", "--run-dir", str(tmp_path)]
+    assert train.main(["--robot", BIPED, "--preset", "debug", *given]) == 2
+    said = capsys.readouterr().err.strip()
+    assert said.endswith(f"it is of the robot xbot_l, not of {BIPED}") and "\n" not in said
+
+
 @pytest.mark.slow(reason="compiles a train step: a minute")
 def test_the_biped_trains_and_resumes(tmp_path):
     run = ["--run-dir", str(tmp_path), "--steps"]

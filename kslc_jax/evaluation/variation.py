@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from kslc_jax.config import ConfigError
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
 
@@ -103,7 +104,9 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
 def _soles(inset: float, robot: Robot, key: jax.Array) -> Fields:
     """Foot boxes inside the described ones, tilted by up to `TILT`."""
     model = robot.mj_model
-    feet = np.array([model.geom(name).id for name in FEET])
+    feet = np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) for foot in FEET])
+    if feet.min() < 0:
+        raise ConfigError(f"sole: the feet of {robot.name} are no single boxes; leave it out")
     key_sides, key_tilt = jax.random.split(key)
     sides = inset * jax.random.uniform(key_sides, (2, 2, 2))  # foot, axis, front or back
     tilt = jax.random.uniform(key_tilt, (2, 2), minval=-TILT, maxval=TILT)

@@ -153,7 +153,12 @@ def _starting_from(
     def chosen() -> tuple[Params, Curriculum]:
         nonlocal step
         policy = storage.load_policy(path)
-        step = policy.step
+        step, theirs = policy.step, policy.config.physics.robot
+        if theirs != config.physics.robot:
+            raise ConfigError(
+                f"cannot start from {path}: it is of the robot {theirs}, not of "
+                f"{config.physics.robot}"
+            )
         try:
             jax.eval_shape(start, like, policy.params, policy.curriculum)
         except ValueError as error:
