@@ -11,6 +11,7 @@ import os
 import shlex
 import time
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -180,13 +181,16 @@ def _starting_from(
 def _train(job: _Job) -> TrainState:
     """Compiles and trains; goes back to a checkpoint if numbers are not finite."""
     start = time.monotonic()
-    state = job.restored() if job.resume else job.init()
-    if job.resume and int(state.step) >= job.config.num_updates:
-        job.progress.say(_nothing_to_do(job, int(state.step)))
-        return state
     if job.resume:
-        job.progress.say(f"resumed at train step {int(state.step)}")
-    compiled = job.step.lower(job.like).compile()
+        state = job.restored()
+        if int(state.step) >= job.config.num_updates:
+            job.progress.say(_nothing_to_do(job, int(state.step)))
+            return state
+        job.progress.say(f"resumed at train step {int(state.step)}; compiling the train step")
+        compiled = _compiled(job)
+    else:
+        job.progress.say("compiling the first state and the train step")
+        state, compiled = _first_state_and_step(job)
     seconds, need = time.monotonic() - start, memory.measured(compiled)
     needs = f", needs {memory.shown(need)}" if need else ""
     job.progress.say(f"compiled in {seconds:.0f} s{needs}; training")
@@ -198,6 +202,20 @@ def _train(job: _Job) -> TrainState:
             except NonFiniteState as bad:
                 state, attempt = _go_back(job, bad, attempt, back_to)
                 back_to = int(state.step)
+
+
+def _compiled(job: _Job) -> Any:
+    return job.step.lower(job.like).compile()
+
+
+def _first_state_and_step(job: _Job) -> tuple[TrainState, Any]:
+    """The first state and the compiled train step. Their programs compile at the same time, in two
+    threads; several processes must run their programs in one order, so they take turns."""
+    if devices.several():
+        return job.init(), _compiled(job)
+    with ThreadPoolExecutor(1) as other:
+        step = other.submit(_compiled, job)
+        return job.init(), step.result()
 
 
 def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tuple[TrainState, int]:
