@@ -88,7 +88,7 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         push=jnp.zeros(5),
         time=jnp.zeros((), jnp.int32),
     )
-    return _observe(config, blank, now, keys[4])
+    return observe(config, blank, now, keys[4])
 
 
 def step(
@@ -143,7 +143,7 @@ def step(
     )
     state = _resample(config, state, keys[1], curriculum, now)
     state = _push(config, state, keys[2])
-    state = _observe(config, state, signals.read(robot, state.physics), keys[3])
+    state = observe(config, state, signals.read(robot, state.physics), keys[3])
     fresh = reset(config, keys[4], curriculum)
     return maths.tree_where(outcome.terminated | outcome.truncated, fresh, state), outcome
 
@@ -263,7 +263,7 @@ def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:
     )
 
 
-def _observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> EnvState:
+def observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> EnvState:
     """Appends the present actor and critic frames to the histories."""
     robot = physics.robot_for(config.physics)
     src = observations.Sources(

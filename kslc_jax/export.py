@@ -1,11 +1,12 @@
 """Takes a policy elsewhere: python -m kslc_jax.export POLICY policy.onnx
 
-Writes the network `history [batch, K, W] -> action [batch, n]` together with everything that a
-robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. The robot's
-model goes beside it as an MJCF without meshes, policy.xml. OUT ends in .onnx or .stablehlo (read
-back by jax.export; the data go beside it in OUT.json). The file is then compared with JAX over
-observations of the policy at work. With --format orbax OUT is a folder that `kslc_jax.load_policy`
-reads: config and actor-critic parameters, without the rest of a checkpoint. See docs/export.md.
+Writes the network `history [batch, K, W] -> action [batch, n]`, and beside it what a robot's
+computer needs to run it. For policy.onnx these are policy.json (joint order, gains, limits, frame
+layout, gait clock; the ONNX file has them as metadata, too), policy.xml (the robot's model, an MJCF
+without meshes) and policy.npz (a golden trace, to test a program with). OUT ends in .onnx or
+.stablehlo (read back by jax.export). The file is then compared with JAX over observations of the
+policy at work. With --format orbax OUT is a folder that `kslc_jax.load_policy` reads: config and
+actor-critic parameters, without the rest of a checkpoint. See docs/export.md.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
@@ -17,12 +18,12 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 import tyro
 
-from kslc_jax import __version__, cli, files
+from kslc_jax import __version__, cli, contract, files
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
 
@@ -33,9 +34,6 @@ if TYPE_CHECKING:
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
 """Histories [B, K, W] to actions [B, n]."""
-
-METADATA_VERSION = 3
-"""Of the names and meanings in `metadata`; grows when one of them changes."""
 
 INSTALL = "pip install 'kslc_jax[export]'"
 TOLERANCE = 1e-5
@@ -68,59 +66,6 @@ class Args:
     def chosen(self) -> str:
         """The format given, or that of the suffix."""
         return self.format or self.out.suffix[1:]
-
-
-def metadata(policy: Policy) -> dict[str, Any]:
-    """What it takes to run the network, JSON-ready: SI units, joints in action order."""
-    from kslc_jax import commands, motors, observations, physics
-
-    config, robot = policy.config, physics.robot_for(policy.config.physics)
-    table = observations.actor_table(robot)
-    held = robot.is_arm & (config.env.arms == "held")
-    return {
-        "metadata_version": METADATA_VERSION,
-        "kslc_jax_version": __version__,
-        "train_step": policy.step,
-        "control_dt": config.control_dt,
-        "joint_names": list(robot.joint_names),
-        "default_joint_pos": robot.default_qpos[7:].tolist(),
-        "kp": robot.kp.tolist(),
-        "kd": robot.kd.tolist(),
-        "effort_limit": robot.effort_limit.tolist(),
-        "speed_limit": robot.speed_limit.tolist(),
-        "torque_knee": motors.TORQUE_KNEE,
-        "action_scale": config.env.action_scale,
-        "action_clip": config.env.action_clip,
-        "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],
-        "history_length": config.env.frames,
-        "observation_clip": config.env.observation_clip,
-        "frame": [{"name": c.name, "width": c.width, "scale": c.scale} for c in table],
-        "gait": {
-            "cycle_time": float(policy.curriculum.cycle_time),
-            "v_max": float(policy.curriculum.v_max),
-            "cycle_follows_speed": config.gait.cycle_follows_speed,
-            "base_cycle_time": config.gait.cycle_time,
-            "cycle_from_speed": config.gait.cycle_from_speed,
-            "cycle_factor": config.curriculum.cycle_factor,
-            "speed_step": config.curriculum.v_step,
-        },
-        "command": {
-            "dead_zone": config.command.dead_zone,
-            "heading_gain": config.command.heading_gain,
-            "max_yaw_rate": config.command.max_yaw_rate,
-            "stand_still": config.command.stand_still,
-            "turning": commands.TURNING,
-        },
-    }
-
-
-def mjcf(policy: Policy) -> str:
-    """The training model of the policy's robot, as the text of an MJCF."""
-    from kslc_jax.robots import build, description
-
-    spec = build.spec(description.read(policy.config.physics.robot), "train")
-    spec.compile()
-    return spec.to_xml()
 
 
 # ------------------------------------------------------------------------------------------- onnx
@@ -207,7 +152,7 @@ def to_onnx(policy: Policy) -> bytes:
         seen = "seen"
     add("actor", seen, "action")
     history = floats("history", "batch", *policy.init().history.shape)
-    action = floats("action", "batch", len(metadata(policy)["joint_names"]))
+    action = floats("action", "batch", len(contract.metadata(policy)["joint_names"]))
     model = helper.make_model(
         helper.make_graph(nodes, "policy", [history], [action], weights),
         opset_imports=[helper.make_opsetid("", _OPSET)],
@@ -215,7 +160,7 @@ def to_onnx(policy: Policy) -> bytes:
         producer_name="kslc_jax",
         producer_version=__version__,
     )
-    helper.set_model_props(model, {k: json.dumps(v) for k, v in metadata(policy).items()})
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in contract.metadata(policy).items()})
     checker.check_model(model, full_check=True)
     return model.SerializeToString()
 
@@ -352,9 +297,7 @@ def _write(policy: Policy, args: Args) -> None:
         save_policy(policy, args.out)
         return
     args.out.write_bytes(WRITE[args.chosen](policy))
-    args.out.with_suffix(".xml").write_text(mjcf(policy))
-    if args.chosen == "stablehlo":
-        files.write_json(args.out.with_name(args.out.name + ".json"), metadata(policy))
+    contract.write(policy, args.out)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array
     the first contact.
     """
     phase = jax.random.uniform(key) if config.random_phase else jnp.zeros(())
-    clock, stance = _clock(config, phase, command)
+    clock, stance = clock_of(config, phase, command)
     zeros = jnp.zeros(2)
     return GaitState(
         phase=phase,
@@ -71,7 +71,7 @@ def update(
     clock (HG). When a foot becomes grounded, `landing` is its air time.
     """
     phase = jnp.mod(state.phase + dt / cycle_time, 1.0)
-    clock, stance = _clock(config, phase, command)
+    clock, stance = clock_of(config, phase, command)
     contact = signals.foot_contact
     grounded = contact | stance | state.contact
     flown = state.air_time > 0.0
@@ -91,7 +91,7 @@ def update(
     )
 
 
-def _clock(config: GaitConfig, phase: jax.Array, command: Command) -> tuple[jax.Array, jax.Array]:
+def clock_of(config: GaitConfig, phase: jax.Array, command: Command) -> tuple[jax.Array, jax.Array]:
     """sin and cos of the phase [2], and the stance mask [2]."""
     angle = 2.0 * jnp.pi * phase
     s = jnp.sin(angle)

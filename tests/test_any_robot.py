@@ -15,9 +15,9 @@ from states import XBOT
 from kslc_jax import (
     checkpoint_format,
     config,
+    contract,
     curriculum,
     env,
-    export,
     gait,
     networks,
     observations,
@@ -151,7 +151,7 @@ def test_joint_angles_count_from_home(biped, setup):
 def reference(biped, setup, phase: float) -> np.ndarray:
     """Reference joint angles from home, at this phase and half of the full speed."""
     still = command(0.5 * setup.gait.full_speed)
-    clock, stance = gait._clock(setup.gait, jnp.asarray(phase), still)
+    clock, stance = gait.clock_of(setup.gait, jnp.asarray(phase), still)
     state = gait.init(setup.gait, jax.random.key(0), still, jnp.zeros(2))
     state = state.replace(clock=clock, stance=stance)
     return np.asarray(gait.reference_pose(setup.gait, biped, state, still))
@@ -266,11 +266,11 @@ def test_a_policy_knows_its_robot(untrained, tmp_path):
 
 
 def test_the_exported_model_is_the_robots(biped, untrained):
-    again = mujoco.MjModel.from_xml_string(export.mjcf(untrained))
+    again = mujoco.MjModel.from_xml_string(contract.mjcf(untrained))
     np.testing.assert_allclose(again.body_mass, biped.mj_model.body_mass, rtol=1e-5)
     np.testing.assert_allclose(again.actuator_gainprm[:, 0], biped.kp)
     assert [again.actuator(i).name for i in range(again.nu)] == list(biped.joint_names)
-    data = export.metadata(untrained)
+    data = contract.metadata(untrained)
     np.testing.assert_allclose(data["default_joint_pos"], biped.default_qpos[7:])
     assert sum(c["width"] for c in data["frame"]) == 38
 

@@ -53,12 +53,36 @@ def test_history_is_zero_after_a_reset_but_for_the_newest_frame(setting):
 def test_time_limit_truncates(setting):
     config, reset, step = setting
     state = reset(jax.random.key(0))
-    late = state.replace(time=jnp.asarray(config.episode_steps - 1))
+    late = state.replace(time=jnp.int32(config.episode_steps - 1))
     new, outcome = step(late, jnp.zeros(16), jax.random.key(1))
     assert bool(outcome.truncated) and not bool(outcome.terminated)
     assert int(new.time) == 0 and int(outcome.episode_steps) == config.episode_steps
     new, outcome = step(state, jnp.zeros(16), jax.random.key(1))
     assert not bool(outcome.truncated) and int(new.time) == 1
+
+
+def test_a_fall_in_the_last_step_is_a_fall(setting):
+    """Its value is not added, as it would be at a time-out."""
+    config, reset, step = setting
+    state = reset(jax.random.key(0))
+    low = state.physics.replace(qpos=state.physics.qpos.at[2].set(0.05))
+    last = state.replace(physics=low, time=jnp.int32(config.episode_steps - 1))
+    _, outcome = step(last, jnp.zeros(16), jax.random.key(1))
+    assert bool(outcome.terminated) and not bool(outcome.truncated)
+
+
+def test_a_push_comes_after_the_reward_and_before_the_frame(debug, monkeypatch):
+    """The last frame is that of the reset."""
+    order = []
+    for name in ("_outcome", "_push", "observe"):
+        real = getattr(env, name)
+        note = lambda *args, name=name, real=real: (order.append(name), real(*args))[1]  # noqa: E731
+        monkeypatch.setattr(env, name, note)
+    cur = curriculum.init(debug)
+    state = jax.eval_shape(lambda: env.reset(debug, jax.random.key(0), cur))
+    order.clear()
+    jax.eval_shape(lambda s: env.step(debug, s, jnp.zeros(16), jax.random.key(1), cur), state)
+    assert order == ["_outcome", "_push", "observe", "observe"]
 
 
 def test_broken_physics_is_masked_and_reset(setting):
@@ -116,9 +140,9 @@ def test_pushes(debug, adds):
     state = env.reset(config, jax.random.key(0), curriculum.init(config))
     velocity = jnp.full(22, 3.0)
     state = state.replace(physics=state.physics.replace(qvel=velocity))
-    off = env._push(config, state.replace(time=jnp.asarray(399)), jax.random.key(1))
+    off = env._push(config, state.replace(time=jnp.int32(399)), jax.random.key(1))
     np.testing.assert_array_equal(off.physics.qvel, velocity)
-    on = env._push(config, state.replace(time=jnp.asarray(400)), jax.random.key(1))
+    on = env._push(config, state.replace(time=jnp.int32(400)), jax.random.key(1))
     pushed = on.physics.qvel - (velocity if adds else 0.0)
     assert np.all(np.abs(pushed[:2]) <= 0.2) and np.all(np.abs(pushed[3:6]) <= 0.4)
     assert np.any(pushed[:2]) and np.any(pushed[3:6])
@@ -131,10 +155,10 @@ def test_a_command_holds_until_its_time_is_over(setting):
     """The reward of the step uses the command that the policy saw, not the new one."""
     config, reset, step = setting
     robot = physics.robot_for(config.physics)
-    state = reset(jax.random.key(3)).replace(command_until=jnp.asarray(800))
+    state = reset(jax.random.key(3)).replace(command_until=jnp.int32(800))
     command = state.command.velocity[:2]
     for time, changes in ((798, False), (799, True)):
-        new, outcome = step(state.replace(time=jnp.asarray(time)), jnp.zeros(16), jax.random.key(4))
+        new, outcome = step(state.replace(time=jnp.int32(time)), jnp.zeros(16), jax.random.key(4))
         assert bool(jnp.any(new.command.velocity[:2] != command)) == changes
         error = signals.read(robot, new.physics).base_linvel[:2] - command
         expected = jnp.exp(-config.rewards.tracking_sigma * jnp.sum(error**2))
@@ -152,12 +176,12 @@ def test_commands_hold_for_8_seconds_or_for_1_to_8(preset_name, shortest):
 def test_tracking_settles_two_seconds_after_a_new_command(setting):
     """With the laptop's settle time: 200 steps after the reset and after a new command at 800."""
     _, reset, step = setting
-    state = reset(jax.random.key(3)).replace(command_until=jnp.asarray(2000))
+    state = reset(jax.random.key(3)).replace(command_until=jnp.int32(2000))
     for time, since, settled in (
         *((0, 0, False), (199, 0, False), (200, 0, True)),
         *((800, 800, False), (999, 800, False), (1000, 800, True)),
     ):
-        now = state.replace(time=jnp.asarray(time), command_since=jnp.asarray(since))
+        now = state.replace(time=jnp.int32(time), command_since=jnp.int32(since))
         _, outcome = step(now, jnp.zeros(16), jax.random.key(4))
         assert bool(outcome.settled) == settled, time
 
@@ -277,7 +301,7 @@ def test_a_step_pushes_and_the_critic_sees_it(debug):
     """Pushes have both signs, up to 0.2 m/s and 0.4 rad/s. The frames show the state after the
     push."""
     cur = curriculum.init(debug)
-    state = env.reset(debug, jax.random.key(0), cur).replace(time=jnp.asarray(399))
+    state = env.reset(debug, jax.random.key(0), cur).replace(time=jnp.int32(399))
     step = jax.jit(jax.vmap(lambda key: env.step(debug, state, jnp.zeros(16), key, cur)[0]))
     new = step(jax.random.split(jax.random.key(1), 300))
     push, seen = np.asarray(new.push), np.asarray(new.privileged_history[:, -1])
@@ -295,5 +319,5 @@ def test_fast_is_settled_and_in_the_top_of_the_range(setting, vx, time, fast):
     _, reset, step = setting
     state = reset(jax.random.key(3))
     asked = state.command.replace(velocity=jnp.array([vx, 0.0, 0.0]))
-    state = state.replace(command=asked, time=jnp.asarray(time))
+    state = state.replace(command=asked, time=jnp.int32(time))
     assert bool(step(state, jnp.zeros(16), jax.random.key(4))[1].fast) == fast

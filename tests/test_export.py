@@ -5,6 +5,7 @@ import dataclasses
 import functools
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from states import ACTOR, MIRROR, XBOT
 
 from kslc_jax import (
     checkpoint_format,
+    contract,
     curriculum,
     env,
     export,
@@ -139,7 +141,7 @@ def test_the_graph_estimates_the_velocity_and_then_acts(policy, onnx_file):
 
 def test_metadata(symmetric, xbot):
     """The numbers are typed by hand where the paper or Humanoid-Gym gives them."""
-    data = export.metadata(symmetric)
+    data = contract.metadata(symmetric)
     assert data["metadata_version"] == 3 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
     assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
@@ -165,11 +167,11 @@ def test_metadata(symmetric, xbot):
 
 def test_the_file_holds_the_metadata_as_json(policy, onnx_file):
     stored = {p.key: json.loads(p.value) for p in onnx.load(onnx_file).metadata_props}
-    assert stored == json.loads(json.dumps(export.metadata(policy)))
+    assert stored == json.loads(json.dumps(contract.metadata(policy)))
 
 
 def test_held_arms_are_named():
-    held = export.metadata(make_policy("plain"))["held_joints"]
+    held = contract.metadata(make_policy("plain"))["held_joints"]
     assert len(held) == 4 and all("shoulder" in name or "elbow" in name for name in held)
 
 
@@ -229,6 +231,7 @@ def test_orbax_has_to_be_asked_for(saved, tmp_path, capsys, monkeypatch):
 def test_command_line(saved, tmp_path, capsys, monkeypatch):
     seen, recorded = [], export.recorded
     monkeypatch.setattr(export, "recorded", lambda p: seen.append(recorded(p)) or seen[0])
+    monkeypatch.setattr(contract, "golden", lambda policy: {})
     out = tmp_path / "new folder" / "policy.onnx"
     assert export.main([str(saved), str(out)]) == 0
     said = capsys.readouterr().out
@@ -242,11 +245,12 @@ def test_command_line(saved, tmp_path, capsys, monkeypatch):
 
 def test_stablehlo_has_its_metadata_beside_it(saved, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(export, "recorded", histories)
+    monkeypatch.setattr(contract, "golden", lambda policy: {})
     out = tmp_path / "policy.bin"
     assert export.main([str(saved), str(out), "--format", "stablehlo"]) == 0
     assert "equals JAX within" in capsys.readouterr().out
-    beside = json.loads((tmp_path / "policy.bin.json").read_text())
-    assert beside["gait"]["v_max"] == V_MAX
+    beside = json.loads((tmp_path / "policy.json").read_text())
+    assert beside["gait"]["v_max"] == V_MAX and beside["latency_budget"] == 0.005
 
 
 def test_errors_are_one_line(saved, tmp_path, capsys):
@@ -329,6 +333,64 @@ def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
         np.testing.assert_allclose(track, wanted, atol=1e-4)
 
 
+@pytest.fixture(scope="module")
+def checker():
+    spec = importlib.util.spec_from_file_location("check_trace", RUNNER.with_name("check_trace.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def contracted(policy, onnx_file):
+    """The exported file with its data, robot and a golden trace of a second beside it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contract, "golden", functools.partial(contract.golden, seconds=1.0))
+        written = contract.write(policy, onnx_file)
+    assert [path.name for path in written] == ["policy.json", "policy.xml", "policy.npz"]
+    return onnx_file
+
+
+def test_a_golden_trace_is_what_its_policy_does(policy, contracted):
+    trace = np.load(contracted.with_suffix(".npz"))
+    np.testing.assert_allclose(trace["command"][:, 0], np.array([0, 0.25, 0.5]) * V_MAX, rtol=1e-6)
+    assert trace["steps"].min() > 50 and trace["target"].shape == (3, 100, 16)
+    moving = 1.0 if not policy.config.command.stand_still else 0.0
+    assert np.abs(trace["frame"][0, 0, :2]).max() > 0.5 * moving
+    frames = np.zeros((3, *policy.init().history.shape), np.float32)
+    for step in range(int(trace["steps"].min())):
+        frames = np.concatenate([frames[:, 1:], trace["frame"][:, step, None]], axis=1)
+        action = np.clip(np.asarray(jax.vmap(policy.act_on)(frames)), -18, 18)
+        held = policy.config.env.arms == "held"
+        action[:, XBOT.is_arm] *= not held
+        np.testing.assert_allclose(trace["action"][:, step], action, atol=1e-5)
+    np.testing.assert_allclose(trace["target"], 0.25 * trace["action"], atol=1e-6)
+
+
+def test_the_runner_follows_the_golden_trace(runner, checker, contracted):
+    assert checker.first_difference(runner.Controller, contracted, 1e-4) is None
+
+
+def test_the_checker_names_the_first_wrong_target(runner, checker, contracted):
+    """A program that mixes up two joints, and one that forgets to advance its clock."""
+
+    class Mixed(runner.Controller):
+        def targets(self, *measured):
+            target = super().targets(*measured)
+            return target if self.history[0].any() else target + 0.001 * np.eye(16)[3]
+
+    class Stopped(runner.Controller):
+        def targets(self, *measured):
+            phase, target = self.phase, super().targets(*measured)
+            self.phase = phase
+            return target
+
+    said = checker.first_difference(Mixed, contracted, 1e-4)
+    assert said.startswith("trial 0 (vx 0.00 m/s), step 0 (0.00 s): left_knee_joint should go to ")
+    said = checker.first_difference(Stopped, contracted, 1e-5)
+    assert re.match(r"trial \d \(vx \d\.\d\d m/s\), step [1-9]\d* ", said)
+
+
 def test_the_runner_refuses_a_timestep_that_does_not_fill_the_control_step(runner, onnx_file):
     model = mujoco.MjModel.from_xml_path(str(description.read(robot.XBOT_L).mjcf))
     controller = runner.Controller(onnx_file, 0.0)
@@ -365,7 +427,7 @@ def test_motor_torque_is_the_packages(runner, symmetric, xbot):
     q, target = rng.uniform(-1, 1, (2, 200, 16))
     dq = rng.uniform(-20, 20, (200, 16))
     one = jax.tree.map(np.asarray, randomize.nominal(XBOT))
-    meta = runner.SimpleNamespace(**export.metadata(symmetric))
+    meta = runner.SimpleNamespace(**contract.metadata(symmetric))
     np.testing.assert_allclose(
         runner.motor_torque(meta, target, q, dq),
         motors.motor_torque(xbot, one, q, dq, target, np),

@@ -54,7 +54,7 @@ def at_phase(phase: float, command=None, config: GaitConfig = PAPER) -> gait.Gai
 )
 def test_stance_mask(phase, left, right):
     assert at_phase(phase).stance.tolist() == [left, right]
-    fresh = gait._clock(PAPER, jnp.asarray(phase), make_command())[1]
+    fresh = gait.clock_of(PAPER, jnp.asarray(phase), make_command())[1]
     assert fresh.tolist() == [left, right]
 
 

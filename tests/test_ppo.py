@@ -214,6 +214,28 @@ def test_update_finds_the_best_action_of_a_bandit():
     assert learner.params["value"] == pytest.approx(0.0, abs=0.1)  # -(a - 2)^2 where a is 2
 
 
+def test_each_epoch_shuffles_anew_and_takes_every_sample_once(monkeypatch):
+    """2 epochs of 4 minibatches; a stand-in for the gradient step notes the samples of each."""
+    config = PPOConfig(minibatches=4, epochs=2)
+
+    def note(config, apply, constants, learner, batch):
+        taken = learner.params["taken"].at[learner.params["count"]].set(batch.index)
+        params = {"taken": taken, "count": learner.params["count"] + 1}
+        return learner.replace(params=params), {}
+
+    monkeypatch.setattr(ppo, "gradient_step", note)
+    size = 64
+    blank = jax.tree.map(lambda x: jnp.zeros((size, *x.shape[1:]), x.dtype), samples())
+    batch = blank.replace(index=jnp.arange(size), valid=jnp.ones(size, bool))
+    learner = ppo.init(config, params())
+    empty = {"taken": jnp.zeros((8, 16), jnp.int32), "count": jnp.int32(0)}
+    learner = learner.replace(params=empty, average={})
+    new, _ = ppo.update(config, bandit_apply, CONSTANTS, learner, batch, jax.random.key(0))
+    epochs = np.asarray(new.params["taken"]).reshape(2, -1)
+    np.testing.assert_array_equal(np.sort(epochs, axis=1), [np.arange(size)] * 2)
+    assert np.mean(epochs[0] == epochs[1]) < 0.2 and np.mean(epochs[0] == np.arange(size)) < 0.2
+
+
 def test_normalised_over_the_valid_samples():
     got = ppo._normalise(jnp.array([1.0, 3.0, 1e6]), jnp.array([True, True, False]))
     np.testing.assert_allclose(got[:2], [-1.0, 1.0], rtol=1e-5)

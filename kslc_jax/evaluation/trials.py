@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import commands, env, maths, networks, observations, physics, randomize, signals
+from kslc_jax import commands, env, gait, maths, networks, observations, physics, randomize, signals
 from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.evaluation import disturbances, schedules, variation
@@ -116,6 +116,29 @@ def trial_config(config: Config, setting: Setting, count: int) -> Config:
         command=dataclasses.replace(config.command, resample_seconds=FOREVER, shortest_seconds=0.0),
         ppo=dataclasses.replace(config.ppo, minibatches=1),
     )
+
+
+def without_joint_noise(config: Config) -> Config:
+    """The config with episodes that start in the home pose."""
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, reset_joint_noise=0.0))
+
+
+def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> env.EnvState:
+    """A reset environment whose first frame shows the command [3]: vx, vy [m/s], heading [rad]."""
+    wanted = commands.Command(
+        velocity=jnp.append(command[:2], 0.0), heading=command[2], moving=jnp.zeros((), bool)
+    )
+    robot = physics.robot_for(config.physics)
+    now = signals.read(robot, state.physics)
+    steered = commands.steer(config.command, wanted, now.base_euler[2])
+    clock, stance = gait.clock_of(config.gait, state.gait.phase, steered)
+    state = state.replace(
+        command=steered,
+        gait=state.gait.replace(clock=clock, stance=stance),
+        history=jnp.zeros_like(state.history),
+        privileged_history=jnp.zeros_like(state.privileged_history),
+    )
+    return env.observe(config, state, now, jax.random.key(0))
 
 
 def with_command(

@@ -1,0 +1,154 @@
+"""What a deployer needs beside the network: data, the robot's model, and a golden trace.
+
+A golden trace holds measurements, and the actions and joint targets that this package computes from
+them. A program for a robot's computer that computes other targets is wrong. examples/check_trace.py
+finds the first difference.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from kslc_jax import __version__, files
+
+if TYPE_CHECKING:
+    from kslc_jax.policy import Policy
+
+METADATA_VERSION = 3
+"""Of the names and meanings in `metadata`; grows when one of them changes."""
+
+TRACE_SECONDS = 10.0
+"""Length of each golden trial."""
+
+SHARES = (0.0, 0.25, 0.5)
+"""Commanded speeds of the golden trials, as shares of v_max."""
+
+SIDEWAYS, HEADING = 0.1, 0.3
+"""Commanded sideways velocity [m/s] and heading [rad] of the second golden trial."""
+
+
+def write(policy: Policy, out: Path) -> list[Path]:
+    """Writes OUT's data as .json, its robot as .xml and its golden trace as .npz; their paths."""
+    beside = [out.with_suffix(suffix) for suffix in (".json", ".xml", ".npz")]
+    budget = policy.config.env.action_delay * policy.config.control_dt
+    files.write_json(beside[0], metadata(policy) | {"latency_budget": budget})
+    beside[1].write_text(mjcf(policy))
+    trace: dict[str, Any] = golden(policy)
+    np.savez_compressed(beside[2], **trace)
+    return beside
+
+
+def metadata(policy: Policy) -> dict[str, Any]:
+    """What it takes to run the network, JSON-ready: SI units, joints in action order."""
+    from kslc_jax import commands, motors, observations, physics
+
+    config, robot = policy.config, physics.robot_for(policy.config.physics)
+    table = observations.actor_table(robot)
+    held = robot.is_arm & (config.env.arms == "held")
+    return {
+        "metadata_version": METADATA_VERSION,
+        "kslc_jax_version": __version__,
+        "train_step": policy.step,
+        "control_dt": config.control_dt,
+        "joint_names": list(robot.joint_names),
+        "default_joint_pos": robot.default_qpos[7:].tolist(),
+        "kp": robot.kp.tolist(),
+        "kd": robot.kd.tolist(),
+        "effort_limit": robot.effort_limit.tolist(),
+        "speed_limit": robot.speed_limit.tolist(),
+        "torque_knee": motors.TORQUE_KNEE,
+        "action_scale": config.env.action_scale,
+        "action_clip": config.env.action_clip,
+        "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],
+        "history_length": config.env.frames,
+        "observation_clip": config.env.observation_clip,
+        "frame": [{"name": c.name, "width": c.width, "scale": c.scale} for c in table],
+        "gait": {
+            "cycle_time": float(policy.curriculum.cycle_time),
+            "v_max": float(policy.curriculum.v_max),
+            "cycle_follows_speed": config.gait.cycle_follows_speed,
+            "base_cycle_time": config.gait.cycle_time,
+            "cycle_from_speed": config.gait.cycle_from_speed,
+            "cycle_factor": config.curriculum.cycle_factor,
+            "speed_step": config.curriculum.v_step,
+        },
+        "command": {
+            "dead_zone": config.command.dead_zone,
+            "heading_gain": config.command.heading_gain,
+            "max_yaw_rate": config.command.max_yaw_rate,
+            "stand_still": config.command.stand_still,
+            "turning": commands.TURNING,
+        },
+    }
+
+
+def mjcf(policy: Policy) -> str:
+    """The training model of the policy's robot, as the text of an MJCF."""
+    from kslc_jax.robots import build, description
+
+    spec = build.spec(description.read(policy.config.physics.robot), "train")
+    spec.compile()
+    return spec.to_xml()
+
+
+def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarray]:
+    """Records R golden trials in the training's engine, each under one constant command.
+
+    The robot starts in its home pose, without noise or delay. A trial ends when the robot falls.
+
+    Returns:
+      command [R, 3]: vx, vy [m/s], heading [rad, world]; phase [R]: of the gait clock, before the
+      first control step; steps [R]: control steps of each trial. For each control step [R, T, ...],
+      NaN after a trial's end: quat [4], angvel [3] (rad/s, base frame), joint_pos [n] (rad),
+      joint_vel [n] (rad/s), frame [W], action [n] (clipped, 0 for held joints), target [n] (rad).
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from kslc_jax import env, physics
+    from kslc_jax.evaluation import trials
+
+    setting = trials.Setting(policy.config.physics)
+    config = trials.trial_config(policy.config, setting, len(SHARES))
+    config = trials.without_joint_noise(config)
+    robot = physics.robot_for(config.physics)
+    home = jnp.asarray(robot.default_qpos[7:], jnp.float32)
+    speeds = np.asarray(SHARES) * float(policy.curriculum.v_max)
+    second = np.arange(len(SHARES)) == 1
+    commands = np.stack([speeds, SIDEWAYS * second, HEADING * second], axis=1).astype(np.float32)
+
+    def start(command: jax.Array, key: jax.Array) -> env.EnvState:
+        return trials.facing_command(config, env.reset(config, key, policy.curriculum), command)
+
+    def one(carry: tuple[env.EnvState, jax.Array], _: None):
+        state, alive = carry
+        before = state.physics
+        key = jax.random.key(0)  # nothing is random
+        new, out = env.step(config, state, policy.act_on(state.history), key, policy.curriculum)
+        alive = alive & ~out.terminated
+        row = {
+            "quat": before.qpos[3:7],
+            "angvel": before.qvel[3:6],
+            "joint_pos": before.qpos[7:],
+            "joint_vel": before.qvel[6:],
+            "frame": state.history[-1],
+            "action": new.last_action,
+            "target": home + config.env.action_scale * new.last_action,
+        }
+        return (new, alive), jax.tree.map(lambda x: jnp.where(alive, x, jnp.nan), row)
+
+    def trial(command: jax.Array, key: jax.Array):
+        state = start(command, key)
+        steps = round(seconds / config.control_dt)
+        (_, _), rows = jax.lax.scan(one, (state, jnp.ones((), bool)), None, steps)
+        return state.gait.phase, rows
+
+    phase, rows = jax.jit(jax.vmap(trial))(
+        commands, jax.random.split(jax.random.key(0), len(SHARES))
+    )
+    rows = jax.tree.map(np.asarray, rows)
+    steps = np.isfinite(rows["target"]).all(axis=-1).sum(axis=1)
+    return {"command": commands, "phase": np.asarray(phase), "steps": steps, **rows}
