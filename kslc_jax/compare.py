@@ -26,9 +26,10 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kslc_jax import cli, evaluate, files, plots
+from kslc_jax import cli, evaluate, files, plots, similar
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError, Fidelity
+from kslc_jax.robot import XBOT_L
 from kslc_jax.training import stopping
 
 WIDTH = 200
@@ -52,6 +53,8 @@ class Args:
     """Seeds of kslc and baseline."""
     ablation_seeds: tuple[int, ...] = (0,)
     """Seeds of the ablations."""
+    robot: str = XBOT_L
+    """A shipped robot, or the path of a description; see `train --robot`."""
     preset: str = "laptop"
     """Preset of kslc and the ablations."""
     baseline: str = "baseline-laptop"
@@ -74,7 +77,7 @@ class Args:
         if unknown:
             raise ConfigError(f"variants: unknown {unknown[0]!r} (known: {', '.join(VARIANTS)})")
         for name in (self.preset, self.baseline):
-            config_lib.preset(name)
+            similar.preset(name, self.robot)
         for name in ("steps", "snapshots", "trials"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1")
@@ -112,8 +115,9 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     preset = args.baseline if variant == "baseline" else args.preset
     parts = (ablation,) if ablation else ()
     without = ("--without", *parts) if parts else ()
-    config = dataclasses.replace(config_lib.preset(preset, parts), seed=seed)
-    what = ("--preset", preset, *without, "--seed", str(seed))
+    config = dataclasses.replace(similar.preset(preset, args.robot, parts), seed=seed)
+    of = () if args.robot == XBOT_L else ("--robot", args.robot)
+    what = (*of, "--preset", preset, *without, "--seed", str(seed))
     length = ("--steps", str(args.steps), "--run.snapshots", str(args.snapshots))
     # A resume names its preset too: train refuses it if the run began with another preset.
     resume = ("--resume",) if has_checkpoints(folder) else ()

@@ -14,6 +14,7 @@ from states import XBOT
 
 from kslc_jax import (
     checkpoint_format,
+    compare,
     config,
     contract,
     curriculum,
@@ -308,3 +309,10 @@ def test_the_biped_trains_and_resumes(tmp_path):
     assert train.main(["--robot", BIPED, "--preset", "debug", *run, "256"]) == 0
     assert train.main(["--resume", *run, "512"]) == 0
     assert policy.load_policy(tmp_path).step == 4
+
+
+def test_compare_takes_a_robot(tmp_path):
+    args = compare.Args(out=tmp_path, robot=BIPED, variants=("kslc", "no-arms"), seeds=(0,))
+    first, second = compare.jobs(args)
+    assert first.config == similar.preset("laptop", BIPED) and first.train[:2] == ("--robot", BIPED)
+    assert second.config == similar.preset("laptop", BIPED, ("arms",))

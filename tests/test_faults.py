@@ -323,10 +323,11 @@ class TestBrokenSamples:
     """Many are said, and all of them for long end a training; both patience 10 train steps."""
 
     LONG = ("--steps", 40 * 128)
+    RARE = (*LONG, "--run.checkpoint-minutes", 100)  # 40 checkpoints would take a minute
 
     def test_ten_train_steps_with_many_are_said_once(self, training, capsys):
         training.broken = lambda step: 0.02 if 5 <= step < 30 else 0.01
-        assert training(lambda state: state, *self.LONG) == 0
+        assert training(lambda state: state, *self.RARE) == 0
         out = capsys.readouterr().out
         assert out.count("warning: ") == 1 and "done: 40 train steps" in out
         assert "in each of the last 10 train steps more than 1% of the samples were broken" in out
@@ -334,12 +335,12 @@ class TestBrokenSamples:
 
     def test_a_second_spell_is_said_again(self, training, capsys):
         training.broken = lambda step: 0.0 if step == 15 else 0.5
-        assert training(lambda state: state, *self.LONG) == 0
+        assert training(lambda state: state, *self.RARE) == 0
         assert capsys.readouterr().out.count("warning: ") == 2
 
     def test_nine_are_not(self, training, capsys):
         training.broken = lambda step: 0.0 if step % 10 == 9 else 0.99
-        assert training(lambda state: state, *self.LONG) == 0
+        assert training(lambda state: state, *self.RARE) == 0
         assert "warning" not in capsys.readouterr().out
 
     def test_all_for_long_end_it_with_one_line(self, training, capsys):

@@ -14,6 +14,8 @@ from kslc_jax.config import HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.robots import description
 
 ENGINES = ("mjx", "mujoco")
+QUICK_FIRST = ("mujoco", pytest.param("mjx", marks=pytest.mark.slow(reason="compiles MJX again")))
+"""Engines of tests that compile a program of their own; `runs` compares the engines."""
 GROUND = 0.6
 
 
@@ -236,7 +238,7 @@ def test_torques_and_sensors_agree(runs):
         assert np.median(np.abs(a - b).max(axis=1)) < tolerance
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", QUICK_FIRST)
 def test_legs_do_not_pass_through_each_other(engine):
     """In the air, both hips close. The feet come to rest side by side."""
     qpos = jnp.asarray(robot.load().default_qpos, jnp.float32).at[2].set(5.0)
@@ -388,7 +390,7 @@ def test_every_range_is_filled_independently():
     assert np.abs(apart - np.eye(len(apart))).max() < 0.1
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", QUICK_FIRST)
 def test_a_program_that_enables_x64_can_step(engine, monkeypatch):
     """A script may need float64 for other things. The state keeps its dtypes, so it can be scanned
     over. Traced only: that is where a wrong dtype shows, and compiling takes long."""
