@@ -231,9 +231,14 @@ def update(
 
 
 def averaged(config: PPOConfig, average: Params, newest: Params) -> Params:
-    """Updates the exponential average with the newest parameters."""
-    keep = config.average
-    return jax.tree.map(lambda a, b: keep * a + (1.0 - keep) * b, average, newest)
+    """Updates the exponential average with the newest parameters.
+
+    Equal parameters leave the average as it is, to the last bit.
+    """
+    if config.average == 0:
+        return newest
+    gain = 1.0 - config.average
+    return jax.tree.map(lambda a, b: a + gain * (b - a), average, newest)
 
 
 def _normalise(advantage: jax.Array, valid: jax.Array) -> jax.Array:
