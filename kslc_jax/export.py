@@ -1,11 +1,11 @@
-"""Takes a policy elsewhere: python -m kslc_jax.export POLICY policy.onnx
+"""Export a policy to a file for other programs: python -m kslc_jax.export POLICY policy.onnx
 
-Writes the network `history [batch, K, W] -> action [batch, n]` together with everything that a
-robot's computer needs to run it: joint order, gains, limits, frame layout, gait clock. The robot's
-model goes beside it as an MJCF without meshes, policy.xml. OUT ends in .onnx or .stablehlo (read
-back by jax.export; the data go beside it in OUT.json). The file is then compared with JAX over
-observations of the policy at work. With --format orbax OUT is a folder that `kslc_jax.load_policy`
-reads: config and actor-critic parameters, without the rest of a checkpoint. See docs/export.md.
+Writes the network `history [batch, K, W] -> action [batch, n]`, and the data that a robot's
+computer needs to run it: joint order, gains, limits, frame layout, gait clock. Also writes the
+robot's model as an MJCF without meshes, policy.xml. OUT ends in .onnx or .stablehlo. `jax.export`
+reads a .stablehlo file; its data are in OUT.json. Then the command compares the file with JAX over
+recorded observations of the policy. With --format orbax OUT is a folder for `kslc_jax.load_policy`:
+config and actor-critic parameters, without the rest of a checkpoint. See docs/export.md.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
@@ -32,31 +32,31 @@ if TYPE_CHECKING:
 
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
-"""Histories [B, K, W] to actions [B, n]."""
+"""Histories [B, K, W] -> actions [B, n]."""
 
 METADATA_VERSION = 3
-"""Of the names and meanings in `metadata`; grows when one of them changes."""
+"""Version of `metadata`; it grows when a name or its meaning changes."""
 
 INSTALL = "pip install 'kslc_jax[export]'"
 TOLERANCE = 1e-5
-"""Largest difference of an action component from JAX's; an action of 1 is `action_scale` rad."""
+"""Largest allowed difference from JAX in a component of the action. 1 means `action_scale` rad."""
 SAMPLES = 1000
-"""Observations that the comparison takes."""
+"""Number of observations in the comparison."""
 
 _OPSET, _IR_VERSION = 17, 8
-"""Old enough for the runtimes on robots (onnxruntime 1.12, 2022)."""
+"""Versions of the ONNX format, old enough for the runtimes on robots (onnxruntime 1.12, 2022)."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to write."""
+    """The policy and the file to write."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
     out: tyro.conf.Positional[Path]
-    """File to write, .onnx or .stablehlo, or folder."""
+    """File to write, .onnx or .stablehlo; with --format orbax, folder to write."""
     format: Format | None = None
-    """Needed only where OUT's suffix does not say it: for orbax, always."""
+    """Format of OUT. Needed if OUT has another suffix, and always for orbax."""
 
     def __post_init__(self):
         if self.chosen not in get_args(Format):
@@ -66,12 +66,15 @@ class Args:
 
     @property
     def chosen(self) -> str:
-        """The format given, or that of the suffix."""
+        """The given format, or the suffix of OUT."""
         return self.format or self.out.suffix[1:]
 
 
 def metadata(policy: Policy) -> dict[str, Any]:
-    """What it takes to run the network, JSON-ready: SI units, joints in action order."""
+    """The data that a program needs to run the network. SI units, joints in action order.
+
+    All values can be written as JSON.
+    """
     from kslc_jax import commands, motors, observations, physics
 
     config, robot = policy.config, physics.robot_for(policy.config.physics)
@@ -115,7 +118,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
 
 
 def mjcf(policy: Policy) -> str:
-    """The training model of the policy's robot, as the text of an MJCF."""
+    """The text of an MJCF: the training model of the policy's robot."""
     from kslc_jax.robots import build, description
 
     spec = build.spec(description.read(policy.config.physics.robot), "train")
@@ -129,11 +132,12 @@ def mjcf(policy: Policy) -> str:
 def dense_layers(
     config: Config, params: Params, network: Literal["actor", "estimator"]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Kernels [in, out] and biases [out] of a network as a plain MLP over the flat history, for the
-    actor followed by the estimated velocity.
+    """Kernels [in, out] and biases [out] of a network as a plain MLP.
 
-    A symmetric network becomes one too: its even and odd layers are the blocks of an ordinary dense
-    layer in the bases of `networks.parity`. That is twice the work, and a graph any runtime knows.
+    Its input is the flat history. If there is an estimator, the estimated velocity follows as
+    further input of the actor. A symmetric network becomes a plain MLP, too: in the bases of
+    `networks.parity` its even and odd layers are the blocks of a dense layer. The MLP needs twice
+    the work, but every runtime has its operations.
     """
     import jax
 
@@ -174,8 +178,14 @@ def _stacked(parts: list[Parity]) -> Parity:
 
 
 def to_onnx(policy: Policy) -> bytes:
-    """The network as ONNX: Flatten, then Gemm with Elu between; metadata as JSON values. An
-    estimator comes first, and Concat puts what it says behind the flat history."""
+    """The network as ONNX, with `metadata` as JSON values.
+
+    The graph is Flatten, then Gemm layers with Elu between them. An estimator comes first; Concat
+    appends its output to the flat history.
+
+    Raises:
+      ConfigError: the package onnx is missing.
+    """
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError as error:
@@ -221,7 +231,7 @@ def to_onnx(policy: Policy) -> bytes:
 
 
 def read_onnx(path: Path) -> Network:
-    """The file's network in onnxruntime; ImportError without it."""
+    """The network of an ONNX file, run by onnxruntime; ImportError if that is missing."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -232,7 +242,7 @@ def read_onnx(path: Path) -> Network:
 
 
 def to_stablehlo(policy: Policy) -> bytes:
-    """The network, serialised by `jax.export` for CPU, CUDA and TPU, with any batch size."""
+    """The network, serialised by `jax.export` for CPU, CUDA and TPU, for any batch size."""
     import jax
     import jax.export
     import jax.numpy as jnp
@@ -244,7 +254,7 @@ def to_stablehlo(policy: Policy) -> bytes:
 
 
 def read_stablehlo(path: Path) -> Network:
-    """The file's network, called by JAX."""
+    """The network of a StableHLO file, run by JAX."""
     import jax.export
 
     exported = jax.export.deserialize(bytearray(path.read_bytes()))
@@ -271,7 +281,7 @@ READ = {"onnx": read_onnx, "stablehlo": read_stablehlo, "orbax": read_orbax}
 
 
 def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
-    """Histories [SAMPLES, K, W] that the policy meets following commands of its own range."""
+    """Recorded histories [SAMPLES, K, W] of the policy, under random commands of its own range."""
     import jax
 
     from kslc_jax import env
@@ -308,7 +318,11 @@ def difference(policy: Policy, network: Network, histories: np.ndarray) -> float
 
 
 def compare(policy: Policy, path: Path, form: str) -> str:
-    """Compares the file with the policy and says how; ConfigError if they are not the same."""
+    """Compares the file with the policy; returns the result as a sentence.
+
+    Raises:
+      ConfigError: an action differs by more than `TOLERANCE`.
+    """
     try:
         network = READ[form](path)
     except ImportError as error:
@@ -329,7 +343,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _export(args: Args) -> None:
-    """Writes the policy, and compares the file with it."""
+    """Writes the policy, and compares the file with the policy."""
     from kslc_jax.policy import load_policy
 
     try:
