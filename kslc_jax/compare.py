@@ -225,7 +225,7 @@ def _short(x: float) -> float:
 
 
 def table(runs: Sequence[Path]) -> Table:
-    """One row per run: its length, the range of commands that it reached, and after how long.
+    """One row per run: its length, the range of commands that it reached, and the steps until then.
 
     Then, per command, the mean forward speed [m/s], or 'falls' if a trial fell.
     """

@@ -7,12 +7,12 @@ bit. The defaults below are those of the laptop preset, or of the --preset that 
 
 Examples:
   python -m kslc_jax.train                          # the laptop preset, on a GPU if there is one
-  python -m kslc_jax.train --preset debug           # seconds, to see that everything works
+  python -m kslc_jax.train --preset debug           # takes seconds: does everything work?
   python -m kslc_jax.train --robot unitree_g1       # another shipped robot, or my/robot.toml
   python -m kslc_jax.train --preset laptop --without arms --seed 1
   python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
   python -m kslc_jax.train --resume --run-dir runs/laptop-seed0
-  python -m kslc_jax.train --profile 3              # where does the time go?
+  python -m kslc_jax.train --profile 3              # trace the time of three train steps
   srun python -m kslc_jax.train --coordinator auto  # one training of all of Slurm's tasks
 """
 

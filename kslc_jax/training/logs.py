@@ -88,9 +88,8 @@ class _Board:
     def __init__(self, folder: Path, after: int):
         folder.mkdir(exist_ok=True)
         self._events = EventsWriter(str(folder / "events"), f".{os.getpid()}.{after}")
-        session = event_pb2.SessionLog(
-            status=event_pb2.SessionLog.START
-        )  # hides what was shown beyond `after`
+        # This event makes TensorBoard hide older records beyond `after`.
+        session = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
         self._events.write_event(event_pb2.Event(step=after + 1, session_log=session))
 
     def write(self, record: dict[str, float]) -> None:

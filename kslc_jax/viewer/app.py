@@ -232,7 +232,7 @@ class Viewer:
         self._pacer = Pacer(self.session.dt)
         shown = round(panel.PLOT_SECONDS / self.session.dt)
         self._recent: collections.deque[View] = collections.deque(maxlen=shown)
-        self._paced: collections.deque[tuple[float, float, float]]  # s: clock, simulated, asked
+        self._paced: collections.deque[tuple[float, float, float]]  # s: clock, simulated, due
         self._paced = collections.deque(maxlen=round(SPEED_SECONDS * FPS))
         self._drawn = 0.0
         self.reset()
