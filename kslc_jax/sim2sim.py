@@ -3,9 +3,9 @@
 Runs trials of the deterministic policy over commanded forward speeds and seeds. The simulator is
 full C MuJoCo (1 ms, PD torque at every step, elliptic cones, converged solver, self-collision,
 joint friction). With --engine drake it is Drake, which has another contact model and solver. Prints
-the table of kslc_jax.evaluate. --perturb repeats the trials with a changed robot or ground. With
---schedule the commands change during a trial, and the table shows the robots' reaction.
-docs/sim2sim.md explains both tables. A * marks conditions beyond the policy's training.
+the table of kslc_jax.evaluate. The option --perturb repeats the trials with a changed robot or
+ground. With --schedule the commands change during a trial, and the table shows the robots'
+reaction. docs/sim2sim.md explains both tables. A * marks conditions beyond the policy's training.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 

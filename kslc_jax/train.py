@@ -2,8 +2,8 @@
 
 The config is a preset, and options override its fields. The run folder gets the config, versions,
 metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and exits; --resume continues bit for
-bit. The defaults below are those of the laptop preset, or of the --preset that you name before
---help.
+bit. The defaults below are those of the laptop preset. Name another --preset before --help to see
+its defaults.
 
 Examples:
   python -m kslc_jax.train                          # the laptop preset, on a GPU if there is one
