@@ -1,4 +1,6 @@
-"""Runs an exported policy on its robot in MuJoCo: numpy, onnxruntime, no JAX (docs/export.md).
+"""Runs an exported policy on its robot in MuJoCo, with numpy and onnxruntime, without JAX.
+
+See docs/export.md.
 
 python examples/onnx_runner.py policy.onnx --vx 1.0 --seconds 10
 """
@@ -16,7 +18,10 @@ STOP = 0.9  # share of the dead zone below which a walking robot stops
 
 
 class Controller:
-    """Computes joint targets from measurements, once per control step; keeps clock and history."""
+    """Computes joint targets from measurements, once per control step.
+
+    Its state is the gait clock, the history of frames and the last action.
+    """
 
     def __init__(self, path, vx, vy=0.0, heading=0.0):
         self.network = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
@@ -32,8 +37,11 @@ class Controller:
         self.history = np.zeros((m.history_length, sum(c.width for c in m.frame)), np.float32)
 
     def command(self, vx, vy=0.0, heading=0.0):
-        """A new command [m/s, rad]. Walking begins above the dead zone and ends below 0.9 of it, so
-        that a joystick that trembles there does not start and stop the robot."""
+        """Sets the command: vx, vy [m/s], heading [rad].
+
+        Walking begins above the dead zone and ends below 0.9 times it. So a trembling joystick at
+        the edge of the dead zone does not start and stop the robot.
+        """
         speed, edge = np.hypot(vx, vy), self.meta.command.dead_zone
         walks = speed > (STOP if self.velocity.any() else 1) * edge
         self.velocity = np.array([vx, vy]) * max(edge / speed, 1) if walks else np.zeros(2)
@@ -63,7 +71,7 @@ class Controller:
 
     @staticmethod
     def cycle(gait, speed):
-        """Seconds of a gait cycle at a commanded forward speed [m/s]."""
+        """Duration [s] of a gait cycle at a commanded forward speed [m/s]."""
         if gait.cycle_from_speed > 0:
             steps = max(speed - gait.cycle_from_speed, 0) / gait.speed_step
             return max(gait.base_cycle_time * gait.cycle_factor**steps, gait.cycle_time)
@@ -71,8 +79,11 @@ class Controller:
         return gait.base_cycle_time + share * (gait.cycle_time - gait.base_cycle_time)
 
     def targets(self, *measured, dt=None):
-        """Joint targets [rad] until the next control step. It advances clock and history. `dt` is
-        the measured time until then [s]; without it, the policy's own control step."""
+        """Joint targets [n, rad] until the next control step; advances clock and history.
+
+        measured: the arguments of `frame`. dt: the time until the next control step [s]; the
+        default is the control step of the training.
+        """
         m, gait = self.meta, self.meta.gait
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
         action = np.array(self.network.run(["action"], {"history": self.history[None]})[0])[0]
@@ -84,15 +95,17 @@ class Controller:
 
 
 def motor_torque(m, target, q, dq):
-    """PD torque within the limits [N m]. Near the speed limit the driving torque falls to zero, and
-    beyond it the motor brakes."""
+    """PD torque [n, N m] within the motors' limits.
+
+    Near the speed limit the driving torque falls to zero. Beyond the limit the motor brakes.
+    """
     full, fall = np.array(m.effort_limit), (1 - m.torque_knee) * np.array(m.speed_limit)
     upper, lower = (full * np.clip((m.speed_limit - s * dq) / fall, -1, 1) for s in (1, -1))
     return np.clip(m.kp * (target - q) - m.kd * dq, -lower, upper)
 
 
 def steps_per_control(control_dt, timestep):
-    """Physics steps in a control step; an error where they do not fill it."""
+    """Number of physics steps in a control step; an error if they do not fill it exactly."""
     steps = max(1, round(control_dt / timestep))
     if abs(steps * timestep - control_dt) > 1e-6 * control_dt:
         raise SystemExit(
@@ -102,7 +115,7 @@ def steps_per_control(control_dt, timestep):
 
 
 def simulate(controller, model, seconds):
-    """Base positions [T, 3] at each control step, until the time is over or the robot falls."""
+    """Base positions [T, 3, m] at each control step, until the time ends or the robot falls."""
     m, data = controller.meta, mujoco.MjData(model)
     steps = steps_per_control(m.control_dt, model.opt.timestep)
     quat, angvel, q, dq = data.qpos[3:7], data.qvel[3:6], data.qpos[7:], data.qvel[6:]  # views

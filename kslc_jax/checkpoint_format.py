@@ -1,13 +1,13 @@
 """The parts that checkpoints and stored policies share: items, schema, checksums, metadata.
 
-A checkpoint holds four orbax items, each usable without the others:
+A checkpoint holds four orbax items. Each can be read without the others:
 
-- ``params``  the networks, all that a policy needs: the actor as it is used, averaged;
-- ``core``    the actor as it is trained, optimiser, learning rate, curriculum, key and step;
-- ``env``     the environments; with it a resumed run equals an uninterrupted one bit for bit;
+- ``params``  the networks of a policy; the actor is the one that acts, averaged over updates;
+- ``core``    the actor in training, optimiser, learning rate, curriculum, key and step;
+- ``env``     the environments; with them a resumed run equals an uninterrupted one bit for bit;
 - ``meta``    JSON: schema version, robot and its numbers, config, metrics of that step, checksums.
 
-Nothing is ever unpickled: arrays are raw numbers, everything else is JSON.
+Reading never unpickles anything: arrays are raw numbers, everything else is JSON.
 """
 
 import json
@@ -29,39 +29,40 @@ from kslc_jax.errors import UserError
 from kslc_jax.fingerprint import Fingerprint, changes, fingerprint
 
 SCHEMA_VERSION = 3
-"""Of a checkpoint's items; raise it with every change of the tree of `TrainState`, and say below
-what the older ones lack."""
+"""Version of a checkpoint's items. Raise it when you change the tree of `TrainState`, and note
+below the parts that the older schemas lack."""
 
 OLDER_POLICIES = (1, 2)
-"""Schemas of which only the policy is still read. 1: no ceiling of the learning rate. 2: no average
-of the actor, no time of the next command, no sums of the curriculum's top."""
+"""Older schemas: only their policy can still be read. 1 lacks the ceiling of the learning rate. 2
+lacks the average of the actor, the time of the next command, and the curriculum's sums of commands
+at the top."""
 
 
 ROBOT_NUMBERS = "robot_numbers"
-"""Entry of a meta item: the `fingerprint` of the robot. Older checkpoints have none."""
+"""Entry of a meta item: the `fingerprint` of the robot. Older checkpoints lack it."""
 
 
 class CheckpointError(UserError, RuntimeError):
-    """A checkpoint that is missing, damaged or of another config; the message says which."""
+    """A checkpoint is missing, damaged or of another config, or it cannot be written."""
 
 
 def is_key(x: Any) -> bool:
-    """True if an array, or its shape, is one of typed random keys."""
+    """True if `x`, an array or an abstract shape, consists of typed random keys."""
     return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def host_array(x: jax.Array) -> np.ndarray:
-    """An array's numbers on the host; those of a typed key are its key data."""
+    """The numbers of an array on the host; for a typed key, its key data."""
     return np.asarray(jax.random.key_data(x) if is_key(x) else x)
 
 
 def typed(numbers: np.ndarray, like: Any) -> Any:
-    """Inverse of `host_array`: key data become keys again, as in `like`."""
+    """Inverse of `host_array`: if `like` is a typed key, the numbers become keys again."""
     return jax.random.wrap_key_data(jnp.asarray(numbers)) if is_key(like) else numbers
 
 
 def checksum(tree: Any) -> int:
-    """CRC-32 of all numbers of a tree. Orbax itself does not notice flipped bits."""
+    """CRC-32 of all numbers of a tree. Orbax itself does not detect flipped bits."""
     crc = 0
     for leaf in jax.tree.leaves(tree):
         crc = zlib.crc32(host_array(leaf).tobytes(), crc)
@@ -69,8 +70,15 @@ def checksum(tree: Any) -> int:
 
 
 def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
-    """Returns the meta item. CheckpointError if it is damaged, of another robot, or of a schema
-    that cannot be read: for resuming the `whole` training, or for the policy alone."""
+    """Checks a meta item and returns it.
+
+    Args:
+      meta: the item.
+      whole: True to resume the training, False to read the policy alone.
+
+    Raises:
+      CheckpointError: the item is damaged, of another robot, or of a schema that cannot be read.
+    """
     schema = meta.get("schema", 1)
     if schema in OLDER_POLICIES and whole:
         raise CheckpointError(
@@ -84,28 +92,28 @@ def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
         )
     require_checksum(meta.get("checksums", {}), "meta", zlib.crc32(_text(meta)))
     ours = _robot(_robot_name(meta))
-    theirs = meta.get("robot", ours)  # the first schema had none
+    theirs = meta.get("robot", ours)  # the first schema lacks this entry
     if theirs != ours:
         raise CheckpointError(f"it is of another robot, {theirs!r:.80}, not of {ours['name']}")
     return meta
 
 
 def changed_robot(meta: dict[str, Any]) -> str:
-    """The numbers in which the robot of a meta item differs now from the stored ones, in one line.
+    """The changes of a meta item's robot since the save, in one line.
 
-    It is empty if there are none, or if no numbers were stored.
+    The text is empty if nothing changed, or if the item stores no numbers of the robot.
     """
     numbers = meta.get(ROBOT_NUMBERS)
     return changes(numbers, fingerprint(_robot_name(meta))) if numbers else ""
 
 
 def _robot_name(meta: dict[str, Any]) -> str:
-    """`physics.robot` of the stored config; before the field existed, there was one robot."""
+    """`physics.robot` of the stored config. Configs without the field are of XBot-L."""
     return meta["config"].get("physics", {}).get("robot", robot_lib.XBOT_L)
 
 
 def _robot(name: str) -> dict[str, Any]:
-    """The robot's name and the order of its joints, which give a policy's actions their meaning."""
+    """The robot's name and its joint order, which defines the components of an action."""
     robot = robot_lib.load(name=name)
     return {"name": robot.name, "joints": list(robot.joint_names)}
 
@@ -116,8 +124,14 @@ def metadata(
     parts: dict[str, Any],
     numbers: Fingerprint | None = None,
 ) -> dict[str, Any]:
-    """The meta item that goes with the other items of a checkpoint; `numbers` are those of the
-    robot that was trained, None if unknown."""
+    """The meta item of a checkpoint.
+
+    Args:
+      config: of the training.
+      metrics: of the train step.
+      parts: the other items; their checksums go into the meta item.
+      numbers: fingerprint of the trained robot; None if unknown.
+    """
     meta = {
         "schema": SCHEMA_VERSION,
         "robot": _robot(config.physics.robot),
@@ -136,19 +150,25 @@ def _text(meta: dict[str, Any]) -> bytes:
 
 
 def require_checksum(stored: dict[str, int], item: str, found: int) -> None:
-    """CheckpointError if `item` has another checksum than stored; older checkpoints have none."""
+    """CheckpointError if the stored checksum of `item` differs from `found`.
+
+    Older checkpoints have no checksums and always pass.
+    """
     if stored.get(item, found) != found:
         raise CheckpointError(f"the numbers of '{item}' are not those that were written")
 
 
 def abstract(tree: Any) -> Any:
-    """Shapes with an explicit sharding, so that a checkpoint restores on any device count."""
+    """Shapes of a tree, with a sharding on one device: so any number of devices can restore it."""
     sharding = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree)
 
 
 def clear_away(folder: Path) -> None:
-    """Removes the remains of failed saves in a folder; their threads may still write a moment."""
+    """Removes the remains of failed saves in a folder.
+
+    It tries for a second, because threads of the failed save may still write.
+    """
     for _ in range(10):
         for path in folder.glob("*.orbax-checkpoint-tmp*"):
             shutil.rmtree(path, ignore_errors=True)
@@ -162,5 +182,5 @@ def has_checkpoints(run_dir: Path) -> bool:
 
 
 def whole_checkpoints(folder: Path) -> list[Path]:
-    """The whole checkpoints in a folder, in any order."""
+    """The complete checkpoints in a folder, in any order."""
     return [p for p in folder.iterdir() if p.name.isdigit() and (p / "params").is_dir()]

@@ -1,4 +1,4 @@
-"""Parts that all commands share: parsing, errors in one line, exit codes, output that lasts.
+"""Parts that all commands share: parsing, errors in one line, exit codes, safe output.
 
 A command module imports neither JAX nor MuJoCo at its top, so that `--help` is quick.
 """
@@ -21,17 +21,17 @@ Paths = Annotated[
     tyro.conf.Positional[tuple[Path, ...]],
     tyro.conf.arg(metavar="PATH [PATH ...]", help_behavior_hint="(at least one)"),
 ]
-"""Paths on a command line; the command checks that there is one."""
+"""Paths on a command line. The command itself checks that there is at least one."""
 
 
 # ----------------------------------------------------------------------------------------- parsing
 
 LONGEST = 30
-"""Digits of the longest whole number that a command line may hold; far above any bound."""
+"""Largest number of digits of a whole number on a command line, far above any real bound."""
 
 
 def whole_number(text: str) -> int:
-    """The integer that `60000000`, `60_000_000` or `60e6` stands for; ValueError if it is none."""
+    """The integer of a text such as `60000000`, `60_000_000` or `60e6`; ValueError otherwise."""
     try:
         number = Decimal(text)
         if number.is_finite() and number.adjusted() < LONGEST and number == int(number):
@@ -46,7 +46,7 @@ _registry = ConstructorRegistry()
 
 @_registry.primitive_rule
 def _integers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
-    """tyro's rule for all integer options, also within tuples and unions."""
+    """The rule by which tyro reads all integer options, also within tuples and unions."""
     if info.type is not int:
         return None
     return PrimitiveConstructorSpec(
@@ -59,7 +59,10 @@ def _integers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
 
 
 def parse(name: str, kind: type[A], argv: list[str] | None, text: str | None, **more: Any) -> A:
-    """The command line of `python -m kslc_jax.NAME` as a `kind`; `text` is its `--help`."""
+    """Reads the command line of `python -m kslc_jax.NAME` into a `kind`.
+
+    `text` is the introduction of its `--help`.
+    """
     prog = f"python -m kslc_jax.{name}"
     return tyro.cli(kind, args=argv, description=text, prog=prog, registry=_registry, **more)
 
@@ -71,10 +74,10 @@ def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
     """Runs a command; returns its exit code.
 
     Args:
-      do: the command's work; returns its exit code, None for 0. A UserError is printed in one line
-        and gives its own code.
-      needs_output: it has failed if its output cannot be written, say on a full disk. Output that
-        nobody reads any more (a closed pipe or terminal) is no failure.
+      do: does the command's work; returns its exit code, None for 0. A UserError prints one line
+        and gives its own exit code.
+      needs_output: True: the command fails if its output cannot be written, as on a full disk.
+        Output without a reader (a closed pipe or terminal) is no failure.
     """
     runtime.prepare(gl=False)
     runtime.quiet()

@@ -1,10 +1,9 @@
-"""KSLC against its baseline and its ablations: python -m kslc_jax.compare [--seeds 0 1 2]
+"""Compare KSLC with its baseline and its ablations: python -m kslc_jax.compare [--seeds 0 1 2]
 
 Trains every variant from scratch, one after the other, and evaluates it over the commanded speeds.
-KSLC and the baseline train with every seed. The command needs nobody to watch it, and it can be
-repeated: it skips finished runs and resumes interrupted ones from their checkpoints. It ends with
-one Markdown table. `python -m kslc_jax.plots` draws performance, momentum, and the learning curve
-of each speed.
+KSLC and the baseline train with every seed. The command runs unattended. If you repeat it, it skips
+finished runs and resumes interrupted ones from their checkpoints. It ends with one Markdown table.
+`python -m kslc_jax.plots` draws performance, momentum, and the learning curve of each speed.
 
 Examples:
   python -m kslc_jax.compare --steps 20000000
@@ -33,7 +32,7 @@ from kslc_jax.robot import XBOT_L
 from kslc_jax.training import stopping
 
 WIDTH = 200
-"""Width of the table in characters. It does not follow the terminal, so no line breaks."""
+"""Width of the table in characters, independent of the terminal: no line may break."""
 
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
 
@@ -45,8 +44,8 @@ class Args:
     out: Path = Path("runs/compare")
     """Folder for the run folders, one per variant and seed."""
     keep: Path | None = None
-    """Folder for copies of the finished runs. A copy has only the data of table and figures: 40 kB
-    a run."""
+    """Folder for copies of the finished runs. A copy has only the data of the table and the
+    figures: 40 kB per run."""
     variants: tuple[str, ...] = VARIANTS
     """kslc, baseline, and no-PART for each ablation."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -68,7 +67,7 @@ class Args:
     trials: int = 8
     """Trials per speed."""
     fidelity: Fidelity = "high"
-    """Physics of the evaluation, as in `evaluate`; high is the same for every preset."""
+    """Physics of the evaluation, as in `evaluate`; high: the same physics for every preset."""
 
     def __post_init__(self):
         if self.keep and self.keep.resolve() == self.out.resolve():
@@ -230,7 +229,7 @@ def _short(x: float) -> float:
 
 
 def table(runs: Sequence[Path]) -> Table:
-    """One row per run: its length, the range of commands that it reached, and after how long.
+    """One row per run: its length, the range of commands that it reached, and the steps until then.
 
     Then, per command, the mean forward speed [m/s], or 'falls' if a trial fell.
     """

@@ -1,4 +1,4 @@
-"""What a deployer needs beside the network: data, the robot's model, and a golden trace.
+"""The files that a deployer needs beside the network: data, the robot's model, a golden trace.
 
 A golden trace holds measurements, and the actions and joint targets that this package computes from
 them. A program for a robot's computer that computes other targets is wrong. examples/check_trace.py
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
 METADATA_VERSION = 3
-"""Of the names and meanings in `metadata`; grows when one of them changes."""
+"""Version of `metadata`; it grows when a name or its meaning changes."""
 
 TRACE_SECONDS = 10.0
 """Length of each golden trial."""
@@ -31,7 +31,10 @@ SIDEWAYS, HEADING = 0.1, 0.3
 
 
 def write(policy: Policy, out: Path) -> list[Path]:
-    """Writes OUT's data as .json, its robot as .xml and its golden trace as .npz; their paths."""
+    """Writes the data (.json), the robot (.xml) and a golden trace (.npz) beside `out`.
+
+    Returns the three paths.
+    """
     beside = [out.with_suffix(suffix) for suffix in (".json", ".xml", ".npz")]
     budget = policy.config.env.action_delay * policy.config.control_dt
     files.write_json(beside[0], metadata(policy) | {"latency_budget": budget})
@@ -42,7 +45,10 @@ def write(policy: Policy, out: Path) -> list[Path]:
 
 
 def metadata(policy: Policy) -> dict[str, Any]:
-    """What it takes to run the network, JSON-ready: SI units, joints in action order."""
+    """The data that a program needs to run the network. SI units, joints in action order.
+
+    All values can be written as JSON.
+    """
     from kslc_jax import commands, motors, observations, physics
 
     config, robot = policy.config, physics.robot_for(policy.config.physics)
@@ -86,7 +92,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
 
 
 def mjcf(policy: Policy) -> str:
-    """The training model of the policy's robot, as the text of an MJCF."""
+    """The text of an MJCF: the training model of the policy's robot."""
     from kslc_jax.robots import build, description
 
     spec = build.spec(description.read(policy.config.physics.robot), "train")

@@ -1,8 +1,9 @@
-"""How well a policy walks and runs: python -m kslc_jax.evaluate POLICY [--speeds 0.5 1.0 ...]
+"""Measure how well a policy walks and runs: python -m kslc_jax.evaluate POLICY [--speeds 0.5 1.0]
 
-Sweeps commanded forward speeds x seeds with the deterministic policy, in the engine it was
-trained in, or with --fidelity high in full C MuJoCo: 1 ms, elliptic cones, converged solver,
-self-collision, joint friction. Prints a table with 95 % confidence intervals; --json keeps it.
+Runs trials of the deterministic policy over commanded forward speeds and seeds. The physics is that
+of the policy's training. With --fidelity high it is full C MuJoCo: 1 ms, elliptic cones, converged
+solver, self-collision, joint friction. Prints a table with 95 % confidence intervals; --json writes
+the numbers to a file.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
 SHORTEST = 3.0
-"""Shortest trial [s]: some time must remain after the robot has gathered speed."""
+"""Shortest trial [s]. Some time must remain after the robot has gathered speed."""
 
 LONGEST = 86_400.0
 """Longest trial [s]: a day."""
@@ -42,13 +43,13 @@ class Args:
     seeds: int = 8
     """Trials per speed."""
     seconds: float = 20.0
-    """Length of a trial."""
+    """Length of a trial [s]."""
     fidelity: Fidelity = "train"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
     noise: bool = False
-    """Sensor noise, action delay and action noise, the most that training has."""
+    """Sensor noise, action delay and action noise at the full level of training."""
     seed: int = 0
-    """Of initial states."""
+    """Seed of the initial states."""
     json: Path | None = None
     """JSON file to write the numbers to."""
 
@@ -58,7 +59,7 @@ class Args:
 
 
 def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
-    """Raises ConfigError if there is nothing to try or to measure."""
+    """Checks the options of the trials; ConfigError if one is out of range."""
     if not (speeds and all(map(math.isfinite, speeds))):
         raise ConfigError("speeds: name at least one, finite")
     if seeds <= 0:

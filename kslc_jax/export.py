@@ -1,4 +1,4 @@
-"""Takes a policy elsewhere: python -m kslc_jax.export POLICY policy.onnx
+"""Export a policy to a file for other programs: python -m kslc_jax.export POLICY policy.onnx
 
 Writes the network `history [batch, K, W] -> action [batch, n]`, and beside it what a robot's
 computer needs to run it. For policy.onnx these are policy.json (joint order, gains, limits, frame
@@ -33,28 +33,28 @@ if TYPE_CHECKING:
 
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
-"""Histories [B, K, W] to actions [B, n]."""
+"""Histories [B, K, W] -> actions [B, n]."""
 
 INSTALL = "pip install 'kslc_jax[export]'"
 TOLERANCE = 1e-5
-"""Largest difference of an action component from JAX's; an action of 1 is `action_scale` rad."""
+"""Largest allowed difference from JAX in a component of the action. 1 means `action_scale` rad."""
 SAMPLES = 1000
-"""Observations that the comparison takes."""
+"""Number of observations in the comparison."""
 
 _OPSET, _IR_VERSION = 17, 8
-"""Old enough for the runtimes on robots (onnxruntime 1.12, 2022)."""
+"""Versions of the ONNX format, old enough for the runtimes on robots (onnxruntime 1.12, 2022)."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to write."""
+    """The policy and the file to write."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
     out: tyro.conf.Positional[Path]
-    """File to write, .onnx or .stablehlo, or folder."""
+    """File to write, .onnx or .stablehlo; with --format orbax, folder to write."""
     format: Format | None = None
-    """Needed only where OUT's suffix does not say it: for orbax, always."""
+    """Format of OUT. Needed if OUT has another suffix, and always for orbax."""
 
     def __post_init__(self):
         if self.chosen not in get_args(Format):
@@ -64,7 +64,7 @@ class Args:
 
     @property
     def chosen(self) -> str:
-        """The format given, or that of the suffix."""
+        """The given format, or the suffix of OUT."""
         return self.format or self.out.suffix[1:]
 
 
@@ -74,11 +74,12 @@ class Args:
 def dense_layers(
     config: Config, params: Params, network: Literal["actor", "estimator"]
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Kernels [in, out] and biases [out] of a network as a plain MLP over the flat history, for the
-    actor followed by the estimated velocity.
+    """Kernels [in, out] and biases [out] of a network as a plain MLP.
 
-    A symmetric network becomes one too: its even and odd layers are the blocks of an ordinary dense
-    layer in the bases of `networks.parity`. That is twice the work, and a graph any runtime knows.
+    Its input is the flat history. If there is an estimator, the estimated velocity follows as
+    further input of the actor. A symmetric network becomes a plain MLP, too: in the bases of
+    `networks.parity` its even and odd layers are the blocks of a dense layer. The MLP needs twice
+    the work, but every runtime has its operations.
     """
     import jax
 
@@ -119,8 +120,14 @@ def _stacked(parts: list[Parity]) -> Parity:
 
 
 def to_onnx(policy: Policy) -> bytes:
-    """The network as ONNX: Flatten, then Gemm with Elu between; metadata as JSON values. An
-    estimator comes first, and Concat puts what it says behind the flat history."""
+    """The network as ONNX, with `metadata` as JSON values.
+
+    The graph is Flatten, then Gemm layers with Elu between them. An estimator comes first; Concat
+    appends its output to the flat history.
+
+    Raises:
+      ConfigError: the package onnx is missing.
+    """
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError as error:
@@ -166,7 +173,7 @@ def to_onnx(policy: Policy) -> bytes:
 
 
 def read_onnx(path: Path) -> Network:
-    """The file's network in onnxruntime; ImportError without it."""
+    """The network of an ONNX file, run by onnxruntime; ImportError if that is missing."""
     import onnxruntime
 
     session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -177,7 +184,7 @@ def read_onnx(path: Path) -> Network:
 
 
 def to_stablehlo(policy: Policy) -> bytes:
-    """The network, serialised by `jax.export` for CPU, CUDA and TPU, with any batch size."""
+    """The network, serialised by `jax.export` for CPU, CUDA and TPU, for any batch size."""
     import jax
     import jax.export
     import jax.numpy as jnp
@@ -189,7 +196,7 @@ def to_stablehlo(policy: Policy) -> bytes:
 
 
 def read_stablehlo(path: Path) -> Network:
-    """The file's network, called by JAX."""
+    """The network of a StableHLO file, run by JAX."""
     import jax.export
 
     exported = jax.export.deserialize(bytearray(path.read_bytes()))
@@ -216,7 +223,7 @@ READ = {"onnx": read_onnx, "stablehlo": read_stablehlo, "orbax": read_orbax}
 
 
 def recorded(policy: Policy, robots: int = 10, steps: int = 500) -> np.ndarray:
-    """Histories [SAMPLES, K, W] that the policy meets following commands of its own range."""
+    """Recorded histories [SAMPLES, K, W] of the policy, under random commands of its own range."""
     import jax
 
     from kslc_jax import env
@@ -253,7 +260,11 @@ def difference(policy: Policy, network: Network, histories: np.ndarray) -> float
 
 
 def compare(policy: Policy, path: Path, form: str) -> str:
-    """Compares the file with the policy and says how; ConfigError if they are not the same."""
+    """Compares the file with the policy; returns the result as a sentence.
+
+    Raises:
+      ConfigError: an action differs by more than `TOLERANCE`.
+    """
     try:
         network = READ[form](path)
     except ImportError as error:
@@ -274,7 +285,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _export(args: Args) -> None:
-    """Writes the policy, and compares the file with it."""
+    """Writes the policy, and compares the file with the policy."""
     from kslc_jax.policy import load_policy
 
     try:

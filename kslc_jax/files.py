@@ -1,4 +1,7 @@
-"""Results on disk: whole or not at all, and a full or forbidden one told in one line."""
+"""Names of the files in a run folder, and writing of results: complete or not at all.
+
+If a file cannot be written, the error has one line.
+"""
 
 import json
 import os
@@ -13,13 +16,13 @@ CONFIG = "config.json"
 """The training's config."""
 
 VERSIONS = "versions.json"
-"""Versions of the packages, the machine, and where the training began."""
+"""Versions of the packages, the machine, and the policy that the training started from."""
 
 METRICS = "metrics.jsonl"
 """One record of metrics per line."""
 
 TENSORBOARD = "tensorboard"
-"""Folder of the same records as TensorBoard events."""
+"""Folder with the same records as TensorBoard events."""
 
 WANDB_ID = "wandb_id"
 """Id of the training's run in Weights & Biases."""
@@ -31,35 +34,35 @@ SNAPSHOTS = "snapshots"
 """Folder of the policies that were kept during the training, one folder per train step."""
 
 LOCK = ".lock"
-"""Locked by the process that trains; holds its process id."""
+"""Lock file. The process that trains locks it, and writes its process id into it."""
 
 PROFILE = "profile"
 """Folder of the profiler's trace."""
 
 BAD_STATE = "bad_state.npz"
-"""The state before the first bad train step of a training that gave up."""
+"""Dump of a training that gave up: the state before the first bad train step."""
 
 EVALUATION = "evaluation.json"
-"""Numbers of `evaluate`, in a run folder of `compare` and beside a shipped policy."""
+"""Results of `evaluate`, in a run folder of `compare` and in the folder of a shipped policy."""
 
 LEARNING = "learning.json"
-"""Numbers of `learning`: how each commanded speed was learnt."""
+"""Results of `learning`: mean speed of each snapshot at each command."""
 
 MILESTONES = "milestones.json"
-"""Beside a shipped policy: environment steps until commands reached each speed."""
+"""In the folder of a shipped policy: environment steps until the commands reached each speed."""
 
 # ------------------------------------------------------------------------------------- writing
 
 
 def _target(path: Path) -> Path:
-    """Where a link leads to, also if nothing is there yet; else the path itself."""
+    """The path that a link points to, even if it does not exist yet; otherwise the path itself."""
     return Path(os.path.realpath(path))
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Writes a file at once: whatever happens, `path` holds all of the old or all of the new.
+    """Writes a file in one step: at any time `path` has either the old text or the new text.
 
-    A link stays one; what it points to is written.
+    If `path` is a link, it stays a link, and its target gets the text.
     """
     path = _target(path)
     part = path.with_name(f".{path.name}.part")
@@ -72,7 +75,7 @@ def write_atomically(path: Path, text: str) -> None:
 
 
 def require_writable(path: Path | None) -> None:
-    """ConfigError where a result could not be written in the end; makes its folder."""
+    """Makes the folder of a result; ConfigError if the result cannot be written there."""
     if path is None:
         return
     try:
@@ -85,8 +88,8 @@ def require_writable(path: Path | None) -> None:
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Keeps numbers as JSON; ConfigError where that fails, and then the old file is still whole."""
-    special = path.exists() and not path.is_file()  # /dev/stdout
+    """Writes numbers as JSON; ConfigError if that fails. The old file is then unchanged."""
+    special = path.exists() and not path.is_file()  # such as /dev/stdout
     try:
         (Path.write_text if special else write_atomically)(path, json.dumps(content, indent=1))
     except OSError as error:

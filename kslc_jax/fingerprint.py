@@ -1,8 +1,8 @@
-"""The robot's numbers: what a training depends on besides its config and the code.
+"""The fingerprint of a robot: the numbers of its description and model.
 
-They are stored with every checkpoint and every policy, so that a robot that has changed since then
-is noticed, and the message says in which numbers. Values that people tune are stored as numbers,
-the rest of the compiled model as one checksum per group and fidelity.
+A training depends on them, on its config and on the code. Every checkpoint and every policy stores
+them. If the robot changes later, a message names the changed numbers. Values that people tune are
+stored as numbers. The rest of the compiled model is stored as one checksum per group and fidelity.
 """
 
 import math
@@ -16,16 +16,16 @@ from kslc_jax.config import Fidelity
 from kslc_jax.robot import Robot
 
 Fingerprint = dict[str, Any]
-"""`values`: per name the numbers in joint order, or by body; `digests`: per fidelity and group."""
+"""`values`: name -> joint or body -> number; `digests`: fidelity -> group -> checksum."""
 
 FIDELITIES: tuple[Fidelity, ...] = ("train", "high")
 
 DECIMALS = 9
-"""Decimals that count: a compiler of another machine may round the last bits of an inertia
-otherwise."""
+"""Number of decimals that are compared. Another machine may round the last bits of an inertia
+differently."""
 
 SHOWN = 3
-"""Changed values of a kind that a message spells out."""
+"""Number of changed values of one kind that a message lists."""
 
 _FIELDS = {
     "inertias": ("body_inertia", "body_ipos", "body_iquat"),
@@ -46,16 +46,16 @@ _COLLISION = (
     *("bodyid", "type", "size", "pos", "quat", "friction", "condim", "contype", "conaffinity"),
     *("priority", "margin", "gap", "solref", "solimp", "solmix"),
 )
-"""Arrays `geom_...` of the geoms that can touch something."""
+"""Arrays `geom_NAME` of the geoms that can touch something."""
 
 _OPTIONS = ("gravity", "integrator", "cone", "solver", "impratio", "tolerance", "disableflags")
-"""Options of the simulation that are not in `PhysicsConfig`."""
+"""Options of the simulation that `PhysicsConfig` does not contain."""
 
 
 def fingerprint(name: str) -> Fingerprint:
-    """The numbers that a robot has now.
+    """The present fingerprint of a robot.
 
-    `name` is that of a shipped robot, or the path of a description.
+    `name` is the name of a shipped robot, or the path of a description.
     """
     robots = {fidelity: robot_lib.load(fidelity, name=name) for fidelity in FIDELITIES}
     return {
@@ -65,8 +65,10 @@ def fingerprint(name: str) -> Fingerprint:
 
 
 def changes(then: Fingerprint, now: Fingerprint) -> str:
-    """The differences between two fingerprints, in one line; empty where there are none. Numbers
-    that one of them lacks count as equal."""
+    """The differences between two fingerprints, in one line; empty if there are none.
+
+    A number that only one of them has does not count as a difference.
+    """
     values = now.get("values", {})
     found = [
         _changed(name, then["values"][name], values[name])
@@ -83,7 +85,7 @@ def changes(then: Fingerprint, now: Fingerprint) -> str:
 
 
 def _changed(name: str, then: dict[str, float], now: dict[str, float]) -> str:
-    """The changed values of one kind, the first ones spelled out."""
+    """Lists the first changed values of one kind, and the number of the others."""
     if then.keys() != now.keys():
         return f"{name} (of other parts)"
     moved = [
@@ -96,7 +98,7 @@ def _changed(name: str, then: dict[str, float], now: dict[str, float]) -> str:
 
 
 def _values(robot: Robot) -> dict[str, dict[str, float]]:
-    """The numbers that people tune, by the name of the joint or the body. SI units."""
+    """The numbers that people tune, in SI units: name -> joint or body -> number."""
     model = robot.mj_model
     joints = model.actuator_trnid[:, 0]
     by_joint = {
@@ -119,7 +121,7 @@ def _values(robot: Robot) -> dict[str, dict[str, float]]:
 
 
 def _digests(robot: Robot) -> dict[str, str]:
-    """A checksum per group of the compiled model's numbers."""
+    """One checksum per group of the compiled model's numbers."""
     model = robot.mj_model
     touching = (model.geom_contype | model.geom_conaffinity) > 0
     touching[np.union1d(model.pair_geom1, model.pair_geom2).astype(int)] = True

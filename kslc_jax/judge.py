@@ -1,9 +1,10 @@
-"""Does a policy meet the bars? python -m kslc_jax.judge POLICY [--quick] [--json out.json]
+"""Compare a policy with all bars: python -m kslc_jax.judge POLICY [--quick] [--json out.json]
 
-Tries the policy in full C MuJoCo at high fidelity: at each commanded speed, under commands that
-change at random from four starting headings, and with each perturbation of sim2sim. Prints one
-table: each bar, what is wanted, the worst that was measured and where. Exits with 0 whether the
-bars are met or not. docs/sim2sim.md says how it measures.
+A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fidelity: at each
+commanded speed, under random changes of the command from four starting headings, and with each
+perturbation of sim2sim. Prints one table: each bar, its required value, the worst measured value,
+and the condition of that value. The exit code is 0 even if the policy misses a bar. docs/sim2sim.md
+describes the measurements.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
@@ -30,7 +31,7 @@ from kslc_jax.evaluation.bars import Bar, bars
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
-"""Commanded speeds [m/s]; the last one is reported, no bar asks for it."""
+"""Commanded speeds [m/s]. No bar uses the last one; it is only reported."""
 
 HEADINGS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 """Starting headings [rad] of the schedule. At pi the measured yaw jumps between pi and -pi."""
@@ -42,7 +43,7 @@ DRAKE_SECONDS = 20.0
 
 @dataclass(frozen=True)
 class Size:
-    """How much is tried: robots per speed or condition, and seconds."""
+    """Size of the measurement: speeds [m/s], headings [rad], robots per condition, seconds."""
 
     speeds: tuple[float, ...]
     seeds: int
@@ -64,22 +65,22 @@ QUICK = Size(
 
 @dataclass(frozen=True)
 class Args:
-    """What to judge, and how thoroughly."""
+    """The policy, and the size of the measurement."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
     quick: bool = False
-    """Few speeds, robots and seconds: a first look."""
+    """A first look: few speeds, robots and seconds."""
     seeds: int | None = None
-    """Trials per speed; None: 4."""
+    """Trials per speed; None: 4, with --quick 2."""
     seconds: float | None = None
-    """Length of the trials at constant speeds; None: 60."""
+    """Length of the trials at constant speeds [s]; None: 60, with --quick 15."""
     drake: bool = False
-    """Tries it in Drake, too: slow, and needs the package drake."""
+    """Also try the policy in Drake. This is slow, and needs the package drake."""
     seed: int = 0
-    """Of initial states, robots and drawn commands."""
+    """Seed of initial states, robots and random commands."""
     json: Path | None = None
-    """Where to keep the numbers; written after each part."""
+    """JSON file to write the numbers to, after each part of the measurement."""
 
     def __post_init__(self):
         require_seed(self.seed)
@@ -87,7 +88,7 @@ class Args:
 
     @property
     def size(self) -> Size:
-        """How much is tried."""
+        """Size of the measurement."""
         asked = {"seeds": self.seeds, "seconds": self.seconds}
         given = {name: value for name, value in asked.items() if value is not None}
         return dataclasses.replace(QUICK if self.quick else FULL, **given)
@@ -100,7 +101,7 @@ Progress = Callable[[str, float], None]
 def measure(
     args: Args, policy, progress: Progress, keep: Callable[[Results], None] = lambda found: None
 ) -> Results:
-    """Everything that `bars` reads; `keep` gets what there is after each part."""
+    """Measures everything that `bars` reads. Calls `keep` with the results after each part."""
     found: Results = {}
     for name, part in PARTS.items():
         if name != "drake" or args.drake:
@@ -176,7 +177,7 @@ def _drake(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
 
 
 PARTS = {"speeds": _speeds, "schedules": _schedules, "perturbed": _perturbed, "drake": _drake}
-"""What is measured, in this order."""
+"""Parts of the measurement, in their order."""
 
 
 def table(found: list[Bar], title: str):
@@ -200,7 +201,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _report(args: Args) -> None:
-    """Judges the policy, prints the table, keeps the numbers."""
+    """Measures the policy, prints the table, writes the numbers."""
     from rich.progress import Progress
 
     from kslc_jax import sim2sim

@@ -1,8 +1,8 @@
-"""Learning curves of each commanded speed: python -m kslc_jax.learning RUN [RUN ...]
+"""Measure the learning curve of each commanded speed: python -m kslc_jax.learning RUN [RUN ...]
 
 Evaluates the policies that a training kept along the way (--run.snapshots). They run at fixed
 commands in the training engine. Writes learning.json into the run folder. `python -m kslc_jax.plots
-learning` draws it, and puts several seeds of one method together.
+learning` draws it, and groups several seeds of one method.
 
 Examples:
   python -m kslc_jax.learning runs/laptop-seed0 runs/laptop-seed1
@@ -56,7 +56,7 @@ def _step(folder: Path) -> int:
 def curve(
     run: Path, args: Args, progress: Callable[[float], None] = lambda share: None
 ) -> dict[str, Any]:
-    """The content of learning.json: per snapshot, survival and tracking at each speed.
+    """The content of learning.json: metrics of each snapshot at each speed.
 
     Args:
       run: run folder.

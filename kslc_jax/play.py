@@ -1,10 +1,10 @@
 """Watch a policy: python -m kslc_jax.play POLICY
 
-Opens a live viewer in the browser: sliders command the robot while it runs. The option --follow
-takes each new policy of a training that is running. The options --gait-strip and --video draw off
+Opens a live viewer in the browser. Its sliders command the robot while it runs. With --follow the
+viewer takes each new policy of a running training. The options --gait-strip and --video draw off
 screen instead. --gait-strip draws the paper's gait figure: the robot every 0.25 s on a 1 m grid,
 one strip per speed. --video makes a film of one speed after the other. The default physics is C
-MuJoCo at high fidelity; strips and films can also use Drake. POLICY is a run folder, a checkpoint
+MuJoCo at high fidelity. Strips and films can also use Drake. POLICY is a run folder, a checkpoint
 folder, or the name of a shipped policy.
 """
 
@@ -51,7 +51,8 @@ class Args:
     seed: int = 0
     """Seed of the initial state."""
     follow: bool = False
-    """Watch a training while it runs: take each new checkpoint or snapshot of this run folder."""
+    """Watch a training while it runs. POLICY is then its run folder; the viewer takes each new
+    checkpoint or snapshot."""
     host: str = "127.0.0.1"
     """Address of the viewer. Only this machine reaches the default; every machine reaches
     0.0.0.0."""
@@ -145,7 +146,7 @@ def caption(picture, text: str):
 
 
 def film_writer():
-    """The module imageio; if it is missing, MissingPackage says what to install."""
+    """The module imageio. If it is missing, MissingPackage says what to install."""
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401 (its own error is clearer than imageio's)

@@ -1,4 +1,4 @@
-"""Figures from stored data:
+"""Draw figures from stored data:
 python -m kslc_jax.plots {training,learning,performance,momentum,schedules} ...
 
 Examples:
@@ -39,10 +39,10 @@ PANELS: tuple[tuple[str, str, str], ...] = (
 
 
 COLUMNS = ("env_steps", "seconds", *(name for name, _, _ in PANELS))
-"""What a metrics.jsonl has to hold."""
+"""Values that each record of a metrics.jsonl must have."""
 
 LEARNT = ("command", "survival", "forward_mean")
-"""What the rows of a learning.json have to hold."""
+"""Values that each row of a learning.json must have."""
 
 PERFORMANCE: tuple[tuple[str, str], ...] = (
     ("forward_mean", "mean forward speed [m/s]"),
@@ -60,7 +60,7 @@ MOMENTUM: tuple[tuple[str, str], ...] = (
 
 
 def read_metrics(path: Path) -> Records:
-    """Columns of a metrics.jsonl, or of the one in a run folder; ValueError if there is none."""
+    """Columns of a metrics.jsonl, or of the one in a run folder; ValueError if not readable."""
     path = path / files.METRICS if path.is_dir() else path
     if not path.is_file():
         raise ValueError(f"no {files.METRICS} at {path}")
@@ -85,13 +85,13 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
 
 
 def in_minutes(seconds: float) -> str:
-    """'34 min', of less than ten '1.5 min': what a GPU takes."""
+    """A time [s] as '34 min'; below ten minutes with a decimal, as '1.5 min'."""
     minutes = seconds / 60.0
     return f"{minutes:.0f} min" if minutes >= 10.0 else f"{minutes:.1f} min"
 
 
 def learning_curve(runs: dict[str, Records], out: Path) -> None:
-    """One panel per quantity, one line per run; the first run's milestones tell its wall time."""
+    """Draws one panel per quantity and one line per run, with the wall times of the first run."""
     figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True, layout="constrained")
     for axis, (name, label, color) in zip(axes, PANELS, strict=True):
         for i, (run, records) in enumerate(runs.items()):
@@ -117,8 +117,14 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
 
 
 def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, float]]]]:
-    """Rows of evaluation files by method: the file's name, or where that is evaluation.json its
-    folder's, without '-seedN'; ValueError."""
+    """Rows of evaluation files, one list per seed, by method.
+
+    The method is the name of the file without '-seedN'. For files with the name evaluation.json it
+    is the name of their folder.
+
+    Raises:
+      ValueError: a file is no evaluation, or the seeds of a method were tried at different speeds.
+    """
     found: dict[str, list[list[dict[str, float]]]] = {}
     for path in paths:
         try:
@@ -141,7 +147,7 @@ def _method(run: str) -> str:
 
 @dataclass(frozen=True)
 class Curve:
-    """How one training learnt the commanded speeds."""
+    """Mean speeds of one training's policies, over its environment steps."""
 
     env_steps: np.ndarray  # [P]
     speeds: tuple[float, ...]  # [V] m/s, commanded
@@ -149,8 +155,13 @@ class Curve:
 
 
 def read_learning(paths: Sequence[Path]) -> dict[str, list[Curve]]:
-    """Curves of learning.json files, or of those in run folders, by method, each cut to what all
-    seeds of its method have; ValueError where they do not fit together."""
+    """Curves of learning.json files, or of those in run folders, by method.
+
+    The seeds of a method are cut to the length of the shortest one.
+
+    Raises:
+      ValueError: a file is no learning curve, or the curves do not fit together.
+    """
     found: dict[str, list[Curve]] = {}
     for path in paths:
         file = path / files.LEARNING if path.is_dir() else path
@@ -181,8 +192,10 @@ def _aligned(name: str, curves: list[Curve]) -> list[Curve]:
 
 
 def learning(methods: dict[str, list[Curve]], out: Path) -> None:
-    """The paper's learning curves: mean forward speed over environment steps, a panel per commanded
-    speed; mean and range over seeds."""
+    """Draws the paper's learning curves: mean forward speed over environment steps.
+
+    Each commanded speed has a panel. A line is the mean over seeds, a band their range.
+    """
     speeds = next(iter(methods.values()))[0].speeds
     figure, axes = _panels(len(speeds))
     for j, (axis, speed) in enumerate(zip(axes, speeds, strict=True)):
@@ -212,22 +225,23 @@ def _panels(count: int, **style):
     for axis in axes.flat[count:]:
         axis.set_visible(False)
     for axis in axes.flat[count - columns : count]:
-        axis.tick_params(labelbottom=True)  # the lowest of its column
+        axis.tick_params(labelbottom=True)  # these panels are the lowest of their columns
     return figure, list(axes.flat[:count])
 
 
 def _legend(figure, axis) -> None:
-    """One legend for all panels, above them, of what one of them shows."""
+    """Draws one legend above all panels, with the lines of the panel `axis`."""
     handles, labels = axis.get_legend_handles_labels()
     columns = min(len(labels), 8)
     figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=8)
 
 
 def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: str, **style):
-    """Mean over seeds of one metric over the commanded speed, and the seeds' range."""
+    """Draws a metric over the commanded speed: mean over seeds, and their range."""
     commands = [row["command"] for row in seeds[0]]
     values = np.array([[row.get(name, np.nan) for row in rows] for rows in seeds])
-    # What nobody survived has no fluctuation: such seeds are left out, and the speed if all are.
+    # A row in which all robots fell lacks the metric. Such seeds are left out, and speeds without
+    # any other seed.
     known = ~np.isnan(values).all(0)
     values, commands = values[:, known], np.array(commands)[known]
     low, high = np.nanmin(values, 0), np.nanmax(values, 0)
@@ -238,7 +252,7 @@ def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: 
 
 
 def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
-    """The paper's performance figure: one panel per metric, over the commanded speed."""
+    """Draws the paper's performance figure: one panel per metric, over the commanded speed."""
     figure, axes = plt.subplots(2, 3, figsize=(12, 7), sharex=True, layout="constrained")
     for axis, (name, label) in zip(axes.flat, PERFORMANCE, strict=True):
         for i, (method, seeds) in enumerate(methods.items()):
@@ -255,7 +269,7 @@ def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
 
 
 def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
-    """Angular momentum about the vertical of whole body, legs and arms, a panel per method."""
+    """Draws the yaw angular momentum of whole body, legs and arms: one panel per method."""
     figure, axes = _panels(len(methods), sharey=True)
     for axis, (method, seeds) in zip(axes, methods.items(), strict=True):
         for i, (name, label) in enumerate(MOMENTUM):
@@ -270,7 +284,7 @@ def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
 
 
 def read_schedules(path: Path) -> list[dict]:
-    """Rows of the nominal robot of a sim2sim --schedule --json file; ValueError if it is none."""
+    """Nominal rows of a file of sim2sim --schedule --json; ValueError if it is no such file."""
     try:
         rows = json.loads(path.read_text())["conditions"]["nominal"]
         _ = [row["series"]["forward"][0][0] for row in rows]
@@ -280,7 +294,7 @@ def read_schedules(path: Path) -> list[dict]:
 
 
 def schedules(rows: list[dict], out: Path) -> None:
-    """Commanded and actual forward speed over time: a column per schedule, a row per robot."""
+    """Draws commanded and actual speed over time: a column per schedule, a row per robot."""
     robots = max(len(row["series"]["forward"]) for row in rows)
     size = (5 * len(rows), 2 * robots + 0.5)
     figure, axes = plt.subplots(
@@ -320,24 +334,24 @@ def _save(figure, out: Path) -> None:
 
 @dataclass(frozen=True)
 class Training:
-    """When the commanded-speed range grew, and the learning curve over environment steps: speed
-    range, tracking, episode length, throughput."""
+    """The course of a training over its environment steps: range of commanded speeds, tracking,
+    episode length, throughput. Also prints when the range grew."""
 
     runs: Paths
     """Run folders or metrics.jsonl files."""
     out: Path = Path("learning_curve.png")
-    """Where the figure goes."""
+    """File of the figure."""
 
 
 @dataclass(frozen=True)
 class Learning:
-    """How each commanded speed was learnt: mean forward speed over environment steps."""
+    """Mean forward speed over environment steps, one panel per commanded speed."""
 
     runs: Paths
-    """Run folders in which kslc_jax.learning was run, or learning.json files; METHOD-seedN folders
-    are put together by method."""
+    """learning.json files, or run folders in which kslc_jax.learning has written one. Runs of the
+    name METHOD-seedN are grouped by method."""
     out: Path = Path("learning.png")
-    """Where the figure goes."""
+    """File of the figure."""
 
 
 @dataclass(frozen=True)
@@ -345,9 +359,9 @@ class Performance:
     """Speed, survival and fluctuations over the commanded speed; mean and range over seeds."""
 
     evaluations: Paths
-    """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
+    """JSON files of evaluate or sim2sim; those in METHOD-seedN folders are grouped by method."""
     out: Path = Path("performance.png")
-    """Where the figure goes."""
+    """File of the figure."""
 
 
 @dataclass(frozen=True)
@@ -355,23 +369,23 @@ class Momentum:
     """Yaw angular momentum of arms, legs and whole body over the commanded speed."""
 
     evaluations: Paths
-    """JSON files of evaluate; those in METHOD-seedN folders are put together by method."""
+    """JSON files of evaluate or sim2sim; those in METHOD-seedN folders are grouped by method."""
     out: Path = Path("momentum.png")
-    """Where the figure goes."""
+    """File of the figure."""
 
 
 @dataclass(frozen=True)
 class Schedules:
-    """Commanded and actual speed over time of the first robots under each schedule."""
+    """Commanded and actual speed of a few robots over time, under each schedule."""
 
     results: tyro.conf.Positional[Path]
     """JSON file of sim2sim --schedule."""
     out: Path = Path("schedules.png")
-    """Where the figure goes."""
+    """File of the figure."""
 
 
 def draw(args: Training | Learning | Performance | Momentum | Schedules) -> None:
-    """Draws the asked figure; ValueError where the data is missing."""
+    """Draws the figure of `args`; ValueError if its data are missing or unreadable."""
     if isinstance(args, Schedules):
         return schedules(read_schedules(args.results), args.out)
     if not (args.runs if isinstance(args, Training | Learning) else args.evaluations):

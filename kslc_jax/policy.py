@@ -1,4 +1,4 @@
-"""A trained policy: to act with, to load, to save. Knows no training."""
+"""A trained policy: acting, loading, saving. Imports no training code."""
 
 import warnings
 from dataclasses import dataclass
@@ -50,7 +50,7 @@ class Policy:
     params: networks.Params
     curriculum: Curriculum  # progress of the training: v_max and gait cycle
     step: int
-    robot: Fingerprint | None = None  # numbers of the robot that was trained; None: not known
+    robot: Fingerprint | None = None  # numbers of the trained robot; None: unknown
 
     def init(self) -> PolicyState:
         """Memory before the first frame."""
@@ -58,7 +58,7 @@ class Policy:
         return PolicyState(jnp.zeros((self.config.env.frames, width)))
 
     def act(self, state: PolicyState, frame: jax.Array) -> tuple[PolicyState, jax.Array]:
-        """Deterministic action [n] for the newest actor frame [W]."""
+        """(new state, deterministic action [n]) for the newest actor frame [W]."""
         history = observations.append_frame(state.history, frame)
         return PolicyState(history), self.act_on(history)
 
@@ -68,12 +68,12 @@ class Policy:
 
 
 def load_policy(path_or_name: str | Path) -> Policy:
-    """Loads a policy from a run folder, a checkpoint folder, or by the name of a shipped one.
+    """Loads a policy from a run folder or a checkpoint folder, or a shipped policy by its name.
 
-    Warns where the robot has changed since the training, and names the numbers.
+    If the robot has changed since the training, a Python warning names the changed numbers.
 
     Raises:
-      CheckpointError: nothing there, or it cannot be read.
+      CheckpointError: there is no policy, or it cannot be read.
     """
     folder = checkpoint_folder(Path(path_or_name))
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
@@ -108,7 +108,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
 
 
 def save_policy(policy: Policy, folder: Path) -> None:
-    """Writes the items that `load_policy` reads; CheckpointError if it cannot."""
+    """Writes the items that `load_policy` reads; CheckpointError if that fails."""
     reached = policy.curriculum
     metrics = {
         "step": policy.step,
@@ -127,15 +127,20 @@ def save_policy(policy: Policy, folder: Path) -> None:
 
 
 def _forget_where(folder: Path) -> None:
-    """Takes the absolute path out of orbax's notes in a stored policy; only their presence counts,
-    and policies are passed on to others."""
+    """Removes the absolute path from the files `commit_success.txt` that orbax writes.
+
+    Orbax only checks that they exist. People pass policies on, and the path is private.
+    """
     for note in folder.rglob("commit_success.txt"):
         note.write_text("Checkpoint commit was successful\n")
 
 
 def policy_name(path_or_name: str | Path) -> str:
-    """The name of a run, of a stored policy or of a shipped one, for results that others read:
-    without the folders of this machine. A checkpoint has the name of its run."""
+    """The name of a policy in published results: without the folders of this machine.
+
+    A run, a stored policy and a shipped policy have the name of their folder. A checkpoint has the
+    name of its run.
+    """
     path = Path(path_or_name).resolve()
     if path.name.isdigit() and path.parent.name in (files.CHECKPOINTS, files.SNAPSHOTS):
         path = path.parent
@@ -143,7 +148,14 @@ def policy_name(path_or_name: str | Path) -> str:
 
 
 def checkpoint_folder(path: Path) -> Path:
-    """The folder of one checkpoint for a run folder, a checkpoint folder or a shipped name."""
+    """The folder of one checkpoint; in a run folder, of the latest one.
+
+    Args:
+      path: run folder, checkpoint folder, or name of a shipped policy.
+
+    Raises:
+      CheckpointError: there is no checkpoint.
+    """
     if not path.exists() and (POLICIES / path).is_dir():
         path = POLICIES / path
     if not path.is_dir():

@@ -130,9 +130,11 @@ def report(rows: list[Row], title: str) -> Table:
 
 
 def repeat(args: Args) -> list[Row]:
-    """Evaluates, and with --train trains; prints a table of each and returns the rows.
+    """Evaluates, and with --train also trains. Prints a table of each, and returns the rows.
 
-    Errors: ConfigError, CheckpointError, and with --train those of `retrain`.
+    Raises:
+      ConfigError, CheckpointError: the policy or its stored numbers cannot be read; with --train
+        also the errors of `retrain`.
     """
     from kslc_jax.policy import POLICIES, load_policy
 

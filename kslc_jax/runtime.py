@@ -1,5 +1,7 @@
-"""Settings that must be made before JAX starts, and facts about this machine. JAX is imported only
-by the functions that need it."""
+"""Settings that must be made before JAX starts, and facts about this machine.
+
+Only the functions that need JAX import it.
+"""
 
 import contextlib
 import ctypes.util
@@ -24,7 +26,7 @@ BAD_JAX = ("0.10.", "0.11.0")
 """JAX versions whose CPU backend can hang for ever in batched Cholesky factorisations."""
 
 JAX_FIX = "pip install -U 'jax>=0.7.2,!=0.10.*,!=0.11.0'"
-"""Command that installs a JAX that does not hang; the versions are those of pyproject.toml."""
+"""Command that installs a JAX that does not hang. pyproject.toml has the same versions."""
 
 
 IDLE_GPU = "there is an NVIDIA GPU, but JAX computes on the CPU"
@@ -33,7 +35,7 @@ CUDA_FIX = "pip install 'kslc_jax[cuda]'"
 """Command that installs a JAX for NVIDIA GPUs."""
 
 NVIDIA = Path("/dev/nvidia0")
-"""Exists where the driver of an NVIDIA GPU is loaded."""
+"""A file that exists if the driver of an NVIDIA GPU is loaded."""
 
 NUMERICS: dict[str, str | bool | int | None] = {
     "jax_enable_x64": False,
@@ -47,18 +49,18 @@ NUMERICS: dict[str, str | bool | int | None] = {
     "jax_debug_nans": False,
     "jax_debug_infs": False,
 }
-"""JAX's options that change numbers, or that stop at a NaN which this package masks, with the
-values that all commands use: JAX's defaults."""
+"""Options of JAX that change numbers, or that stop at a NaN although this package masks it. All
+commands use these values, which are JAX's defaults."""
 
 _YES, _NO = ("1", "true", "t", "yes", "y", "on"), ("0", "false", "f", "no", "n", "off")
 
 XLA_THREADS = "PJRT_NPROC"
-"""Variable that tells XLA how many threads to start on a CPU. By itself XLA knows the affinity, but
-no quota."""
+"""Environment variable with the number of XLA's threads on a CPU. XLA itself reads the affinity,
+but no quota."""
 
 
 GL_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
-"""Values of MUJOCO_GL, the better one first, and the libraries that they need."""
+"""Value of MUJOCO_GL -> the library that it needs; the better one first."""
 
 
 def cache_dir() -> Path:
@@ -68,10 +70,13 @@ def cache_dir() -> Path:
 
 
 def prepare(gl: bool = True) -> None:
-    """Sets environment variables: a quiet XLA, a persistent compilation cache, as many threads as
-    this process may use, and with `gl` the library that draws off screen. Variables that the user
-    has set stay, except those that change numbers (`NUMERICS`), which are overridden with a warning
-    on stderr. Call it before JAX and MuJoCo are imported."""
+    """Sets environment variables; call it before JAX and MuJoCo are imported.
+
+    It makes XLA quiet, and sets a persistent compilation cache and the number of threads that this
+    process may use. With `gl` it also chooses the library that draws off screen. Variables that the
+    user has set stay. The exceptions are those that change numbers (`NUMERICS`): it removes them,
+    with a warning on stderr.
+    """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_dir()))
     if usable_cpus() < affine_cpus():
@@ -83,8 +88,10 @@ def prepare(gl: bool = True) -> None:
 
 
 def fix_numerics() -> list[str]:
-    """Resets JAX's options that change numbers, in the environment, and in JAX where it is already
-    imported; returns what was set otherwise, as NAME=VALUE."""
+    """Resets the options of `NUMERICS` in the environment, and in JAX if it is already imported.
+
+    Returns the options that had another value, as NAME=VALUE.
+    """
     found = {}
     for name, ours in NUMERICS.items():
         text = os.environ.pop(name.upper(), "")
@@ -92,7 +99,7 @@ def fix_numerics() -> list[str]:
             found[name.upper()] = text
         if jax := sys.modules.get("jax"):
             options = jax.config
-            value = getattr(options, name, ours)  # a JAX may have dropped an option
+            value = getattr(options, name, ours)  # a JAX version may lack an option
             if value != ours:
                 found.setdefault(name.upper(), str(value))
                 options.update(name, ours)
@@ -107,15 +114,18 @@ def _means(text: str, value: str | bool | int | None) -> bool:
 
 
 def affine_cpus() -> int:
-    """CPUs that the process's affinity allows."""
+    """Number of CPUs that the affinity of the process allows."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def cpu_quota(root: Path = Path("/")) -> float:
-    """CPUs that the process's control groups, and those above them, allow it; a fraction is
-    possible, infinity is no limit. Reads Linux's cgroups of version 2 (`cpu.max`) and 1."""
+    """Number of CPUs that the process's control groups and their parents allow.
+
+    It may be a fraction. Infinity means no limit. It reads Linux's cgroups of version 2 (`cpu.max`)
+    and 1. `root` is the root of the file system.
+    """
     quota = math.inf
     for line in _read(root / "proc/self/cgroup").splitlines():
         _, controllers, path = line.split(":", 2)
@@ -123,25 +133,25 @@ def cpu_quota(root: Path = Path("/")) -> float:
             continue
         top = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
         parts = [part for part in path.split("/") if part]
-        # In a container the path may be the host's; then its top is the container's own group.
+        # In a container the path may be that of the host. The container's own group is then `top`.
         groups = [top.joinpath(*parts[:depth]) for depth in range(len(parts) + 1)]
         quota = min([quota, *map(_group_quota, groups)])
     return quota
 
 
 def _group_quota(group: Path) -> float:
-    """CPUs that one control group allows."""
+    """Number of CPUs that one control group allows."""
     v1 = _read(group / "cpu.cfs_quota_us"), _read(group / "cpu.cfs_period_us")
     words = _read(group / "cpu.max").split() or [word.strip() for word in v1]
     try:
         quota, period = map(float, words)
-    except ValueError:  # "max", or no such files
+    except ValueError:  # the quota is "max", or the files do not exist
         return math.inf
     return quota / period if quota > 0 and period > 0 else math.inf
 
 
 def _read(path: Path) -> str:
-    """Text of a file; empty where it cannot be read."""
+    """Text of a file; empty if it cannot be read."""
     try:
         return path.read_text()
     except OSError:
@@ -149,13 +159,15 @@ def _read(path: Path) -> str:
 
 
 def usable_cpus() -> int:
-    """Threads that this process can run at the same time: as affinity and quota allow."""
+    """Number of threads that this process can run at the same time, by affinity and quota."""
     return max(1, math.ceil(min(affine_cpus(), cpu_quota())))
 
 
 def choose_gl() -> None:
-    """Sets MUJOCO_GL to EGL, or else OSMesa, if the user has not set it and the library is there.
-    MuJoCo reads it once, when it is first imported."""
+    """Sets MUJOCO_GL to egl, else to osmesa, if that library is installed.
+
+    A value that the user has set stays. MuJoCo reads the variable once, at its first import.
+    """
     if os.environ.get("MUJOCO_GL"):
         return
     for backend, library in GL_LIBRARIES.items():
@@ -165,9 +177,12 @@ def choose_gl() -> None:
 
 
 def quiet() -> None:
-    """Silences libraries' reports of errors that this package reports itself, and prints Python
-    warnings in one line. It changes the whole process: for commands only."""
-    # Orbax raises its errors, and also prints pages of tracebacks of its threads.
+    """Silences error reports of libraries, and prints Python warnings in one line.
+
+    This package reports these errors itself. The function changes the whole process, so only
+    commands call it.
+    """
+    # Orbax raises its errors. It also prints pages of tracebacks of its threads.
     for name in ("absl", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     sys.excepthook, sys.unraisablehook = _excepthook, _unraisablehook
@@ -192,12 +207,12 @@ def _one_line(message: Warning | str, *_: Any, **__: Any) -> str:
 
 
 def first_line(error: Exception) -> str:
-    """The first line of an error's message, cut to what fits a terminal."""
+    """The first line of an error's message, at most 200 characters."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def idle_gpu() -> str:
-    """A message if there is an NVIDIA GPU that JAX does not use; else empty."""
+    """A message if JAX does not use an NVIDIA GPU of this machine; else empty."""
     import jax
 
     if jax.default_backend() != "cpu" or not NVIDIA.exists():
@@ -217,15 +232,15 @@ def require_good_jax() -> None:
 
 
 def check_jax(version: str, backend: str) -> None:
-    """Raises JaxError, with the fix, for versions that hang on this backend."""
+    """Raises JaxError if this version of JAX hangs on this backend. The message has the fix."""
     if backend == "cpu" and version.startswith(BAD_JAX):
         raise JaxError(f"jax {version} can hang for ever on a CPU, install another: {JAX_FIX}")
 
 
 class Watchdog:
-    """Prints every thread's stack to stderr while a step takes far longer than those before.
+    """Prints the stack of every thread to stderr if a step takes far longer than those before.
 
-    faulthandler's own thread waits and prints: it runs even where Python's threads cannot.
+    A thread of faulthandler waits and prints. It runs even if Python's threads cannot run.
     """
 
     def __init__(self, factor: float = 20.0, least: float = 60.0, first: float = 600.0):
@@ -233,7 +248,7 @@ class Watchdog:
         self._seconds: deque[float] = deque(maxlen=100)
 
     def limit(self) -> float:
-        """Seconds that the next step may take."""
+        """Longest time [s] that the next step may take before the stacks are printed."""
         if not self._seconds:
             return self.first
         return max(self.least, self.factor * statistics.median(self._seconds))

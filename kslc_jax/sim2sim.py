@@ -1,11 +1,11 @@
-"""Does a policy survive another simulator? python -m kslc_jax.sim2sim POLICY [--perturb all]
+"""Try a policy in another simulator: python -m kslc_jax.sim2sim POLICY [--perturb all]
 
-Sweeps commanded forward speeds x seeds with the deterministic policy in full C MuJoCo (1 ms, PD
-torque at every step, elliptic cones, converged solver, self-collision, joint friction) or, with
---engine drake, in Drake, whose contact model and solver are its own. Prints the table of
-kslc_jax.evaluate; --perturb repeats the sweep on a changed robot or ground. With --schedule the
-commands change during a trial, and the table says how the robots react. How to read both:
-docs/sim2sim.md. A * marks what the policy was not trained for.
+Runs trials of the deterministic policy over commanded forward speeds and seeds. The simulator is
+full C MuJoCo (1 ms, PD torque at every step, elliptic cones, converged solver, self-collision,
+joint friction). With --engine drake it is Drake, which has another contact model and solver. Prints
+the table of kslc_jax.evaluate. The option --perturb repeats the trials with a changed robot or
+ground. With --schedule the commands change during a trial, and the table shows the robots'
+reaction. docs/sim2sim.md explains both tables. A * marks conditions beyond the policy's training.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
@@ -18,8 +18,8 @@ Examples:
   python -m kslc_jax.sim2sim runs/laptop-seed0 --schedule my.json --punch 300 --heading 0 3.14159
   python -m kslc_jax.sim2sim runs/laptop-seed0 --engine drake --seconds 20 --seeds 2
 
-A schedule of one's own is a JSON list that starts over at its end; vy, yaw_rate and heading may be
-left out, a heading [rad, world] goes in place of a yaw_rate:
+Your own schedule is a JSON list; it repeats after its end. vy, yaw_rate and heading are optional. A
+step has either a yaw_rate or a heading [rad, world]:
   [{"seconds": 5, "vx": 3, "vy": 0, "yaw_rate": 0}, {"seconds": 4, "vx": 0, "heading": 1.57}]
 """
 
@@ -51,56 +51,58 @@ if TYPE_CHECKING:
 Engine = Literal["mujoco", "drake"]
 
 MOST_LATENCY = 50
-"""Control steps by which actions may come late."""
+"""Largest delay of the actions [control steps]."""
 
 
 @dataclass(frozen=True)
 class Args:
-    """What to try, and under what conditions."""
+    """The policy and the conditions of its trials."""
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
     engine: Engine = "mujoco"
-    """mujoco: C MuJoCo on all cores. drake: one robot at a time, slow, and needs the package drake
+    """mujoco: C MuJoCo on all cores. drake: one robot at a time, slow; it needs the package drake
     (pip install 'kslc_jax[drake]')."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
     """Commanded forward speeds [m/s]."""
     sideways: float = 0.0
-    """Side step commanded with every speed [m/s], to the left."""
+    """Sideways velocity commanded with every speed [m/s], positive to the left."""
     turn: float = 0.0
-    """Yaw rate commanded with every speed [rad/s], to the left; 0 keeps the heading."""
+    """Yaw rate commanded with every speed [rad/s], positive to the left; 0 keeps the heading."""
     seeds: int = 32
     """Trials per speed."""
     seconds: float = 60.0
-    """Length of a trial."""
+    """Length of a trial [s]."""
     noise: bool = False
-    """Sensor noise, action delay and action noise, the most that training has."""
+    """Sensor noise, action delay and action noise at the full level of training."""
     latency: int = 0
-    """Control steps by which every action comes late; --latency alone means 1."""
+    """Delay of every action [control steps]; --latency alone means 1."""
     schedule: tuple[str, ...] = ()
     """Commands that change during a trial, in place of --speeds: stop (top speed 5 s, rest 4 s),
-    reverse (top 5 s, backwards 4 s), box (every 4 s a command as training draws them), random
-    (every 1 to 4 s, with stops and reversals from the top), jitter (every 0.3 to 4 s), turns (at
-    three speeds), tour (way-points), or a JSON file."""
+    reverse (top speed 5 s, backwards 4 s), box (a new command as in training every 4 s), random
+    (the same every 1 to 4 s, with stops and reversals from the top speed), jitter (as random, every
+    0.3 to 4 s), turns (at three speeds), tour (way-points), or the path of a JSON file."""
     top: float | None = None
-    """Fastest speed of a schedule [m/s]; None: the fastest that the policy was trained for."""
+    """Fastest command of a schedule [m/s]; None: the fastest command of the policy's training."""
     heading: tuple[float, ...] = (0.0,)
-    """Where robots head at the start [rad]; with several the first is the nominal one."""
+    """Heading of the robots at the start [rad]. The first value is the nominal one; each further
+    value repeats the trials."""
     punch: float = 0.0
     """Force [N] for 0.08 s at a random link in a random direction every 4 s."""
     hold_arms: bool = False
-    """The arms' targets walk at random, at most 0.3 rad/s, whatever the policy asks for."""
+    """The arms follow random targets, at most 0.3 rad/s fast, in place of the policy's actions."""
     perturb: tuple[str, ...] = ()
-    """Repeat the sweep with each of these: friction=MU, payload=KG on the base, com=M (the base's
-    centre of mass forwards, to the left and up), push=M/S (largest push along x and y, every 4 s),
-    gains=FACTOR on kp and kd, strength=FACTOR on the motors' torque, imu=RAD (constant error of
-    roll and pitch), links=SHARE (each link's mass differs by up to it), hands=KG at each hand,
-    sole=M (a sole's sides wander by up to it), joints=X (up to X N m of friction and N m s/rad of
-    damping more in each joint), heading=RAD; all: a list of sixteen."""
+    """Repeat the trials with each of these: friction=MU, payload=KG on the base, com=M (shift of
+    the base's centre of mass forwards, to the left and up), push=M/S (largest push along x and y,
+    every 4 s), gains=FACTOR on kp and kd, strength=FACTOR on the motors' torque, imu=RAD (constant
+    error of roll and pitch), links=SHARE (largest change of each link's mass), hands=KG at each
+    hand, sole=M (largest distance of a sole's sides from the foot's outline), joints=X (each joint
+    gets up to X N m more friction and X N m s/rad more damping), heading=RAD at the start; all:
+    sixteen of these."""
     seed: int = 0
-    """Of initial states."""
+    """Seed of the initial states."""
     json: Path | None = None
-    """Where to keep the numbers."""
+    """JSON file to write the numbers to."""
 
     def __post_init__(self):
         evaluate.check(self.speeds, self.seeds, self.seconds)
@@ -122,7 +124,7 @@ class Args:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """What to run, the unperturbed robot first."""
+        """All conditions to try, the nominal one first."""
         every = [c for c in ALL if self.engine == "mujoco" or "variation" not in changes(c)]
         asked = (c for name in self.perturb for c in (every if name == "all" else (name,)))
         turned = (f"heading={yaw:g}" for yaw in self.heading[1:])
@@ -130,8 +132,11 @@ class Args:
 
 
 def simulator(engine: Engine):
-    """What steps `trials.Setting`s in that engine: None for MuJoCo, which is what their physics
-    config says; MissingPackage where it is not installed."""
+    """The value of `trials.Setting.simulate` for an engine: None for MuJoCo.
+
+    Raises:
+      MissingPackage: the engine is not installed.
+    """
     if engine == "mujoco":
         return None
     try:
@@ -142,7 +147,7 @@ def simulator(engine: Engine):
 
 
 def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
-    """The conditions of one sweep."""
+    """The setting of the trials under one condition."""
     from kslc_jax.evaluation import trials
 
     plain = trials.Setting(
@@ -162,7 +167,7 @@ CONDITIONS = (
     *("engine", "sideways", "turn", "seeds", "seconds", "noise", "latency", "seed"),
     *("schedule", "top", "heading", "punch", "hold_arms"),
 )
-"""Options that the JSON repeats."""
+"""Options that the JSON file records."""
 
 Results = dict[str, list[dict[str, Any]]]
 
@@ -172,8 +177,10 @@ def sweeps(
     policy: "Policy",
     progress: Callable[[str, float], None] = lambda condition, share: None,
 ) -> Results:
-    """Rows for every condition, of `measure` or of `scheduled.measure`; `progress` is told where it
-    is."""
+    """The rows of `measure`, or with a schedule of `scheduled.measure`, for every condition.
+
+    It calls `progress` with the condition and the share [] of it that is done.
+    """
     return {
         condition: _rows(args, policy, condition, functools.partial(progress, condition))
         for condition in args.conditions
@@ -183,7 +190,7 @@ def sweeps(
 def _rows(
     args: Args, policy: "Policy", condition: str, progress: Callable[[float], None]
 ) -> list[dict[str, Any]]:
-    """The rows of one condition, with the reasons why they lie beyond the training."""
+    """The rows of one condition, with the reasons of `trained.beyond`."""
     from kslc_jax.evaluation import scheduled, schedules, trained, trials
     from kslc_jax.evaluation.measure import measure
 
@@ -217,7 +224,7 @@ def summary(results: Results, title: str) -> Table:
 
 
 def with_latency(argv: list[str]) -> list[str]:
-    """The command line with a 1 after a `--latency` that has no number."""
+    """Adds a 1 to the command line after a `--latency` that has no number."""
     out: list[str] = []
     for word, after in zip(argv, [*argv[1:], ""], strict=True):
         out += [word, "1"] if word == "--latency" and not after.isdigit() else [word]
@@ -231,17 +238,17 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _report(args: Args) -> None:
-    """Tries the policy under all conditions, prints the tables, keeps the numbers."""
-    simulator(args.engine)  # what is not installed is told before anything is loaded
+    """Tries the policy under all conditions, prints the tables, writes the numbers."""
+    simulator(args.engine)  # fails now if the engine's package is missing
     from kslc_jax.evaluation import schedules
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
-    for name in args.schedule:  # told before any trial
+    for name in args.schedule:  # an unreadable schedule fails before any trial
         schedules.named(name, policy.config, float(policy.curriculum.v_max), args.top)
     screen = tables.console()
-    # Reports come once a simulated second: the estimate of the time left needs a long memory.
+    # One report per simulated second: the estimate of the remaining time needs a long window.
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in args.conditions}
 

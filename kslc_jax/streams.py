@@ -1,4 +1,4 @@
-"""Output of a command whose reader may go away: `head`, a pager that is left, a closed terminal."""
+"""Output of a command whose reader may disappear: `head`, a pager, a closed terminal."""
 
 import contextlib
 import errno
@@ -9,17 +9,17 @@ from collections.abc import Generator
 from typing import Any, TextIO
 
 GONE = (errno.EPIPE, errno.EIO)
-"""Errors of a write that nobody can read any more: a closed pipe, a closed terminal."""
+"""Errors of a write without a reader: a closed pipe, a closed terminal."""
 
 
 class _Sink(io.FileIO):
-    """Writes to a file descriptor, and throws away what cannot be written."""
+    """Writes to a file descriptor, and discards data that cannot be written."""
 
     failure: OSError | None = None
-    """First error that lost output while somebody could read it, such as a full disk."""
+    """First error that lost output although it had a reader, such as a full disk."""
 
     def write(self, data: Any, /) -> int:
-        """Number of bytes written or thrown away."""
+        """Writes or discards the data; returns the number of bytes."""
         try:
             return super().write(data)
         except OSError as error:
@@ -29,7 +29,7 @@ class _Sink(io.FileIO):
 
 
 def _lasting(stream: TextIO) -> tuple[TextIO, _Sink]:
-    """A stream like `stream` that no write to it can fail on."""
+    """(a stream like `stream` on which no write fails, its sink)."""
     stream.flush()
     sink = _Sink(stream.fileno(), "w", closefd=False)
     text = io.TextIOWrapper(
@@ -42,14 +42,16 @@ def _lasting(stream: TextIO) -> tuple[TextIO, _Sink]:
 
 
 def open_missing() -> None:
-    """Opens /dev/null as standard input, output or error where a process was started without.
+    """Opens /dev/null for standard input, output or error if the process started without them.
 
-    Else the next file that is opened, say a checkpoint, would get what libraries print."""
+    Otherwise the next opened file, such as a checkpoint, would take the free descriptor, and
+    libraries would print into it.
+    """
     for number in (0, 1, 2):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
 
 
 class Output:
@@ -60,15 +62,15 @@ class Output:
 
     @property
     def failure(self) -> OSError | None:
-        """Why output was lost; None if it was not, or if nobody reads it."""
+        """The error that lost output; None if no output was lost, or if it had no reader."""
         return next((sink.failure for sink in self.sinks if sink.failure), None)
 
 
 @contextlib.contextmanager
 def lasting() -> Generator[Output]:
-    """Within the context no write to the process's own stdout and stderr fails.
+    """Within the context, no write to the process's own stdout and stderr fails.
 
-    Streams that somebody has put in their place, as notebooks do, stay as they are.
+    If the caller has replaced these streams, as notebooks do, they stay unchanged.
     """
     output, before = Output(), (sys.stdout, sys.stderr)
     if sys.stdout is sys.__stdout__ and sys.stdout is not None:

@@ -1,18 +1,18 @@
 """Train a robot to walk and run: python -m kslc_jax.train [--preset NAME] [--any.nested.field V]
 
-Picks a preset, lets every field of it be overridden, and trains into a run folder that holds the
-config, versions, metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and leaves;
---resume goes on bit for bit. The defaults below are those of the laptop preset, or of the --preset
-named before --help.
+The config is a preset, and options override its fields. The run folder gets the config, versions,
+metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and exits; --resume continues bit for
+bit. The defaults below are those of the laptop preset. Name another --preset before --help to see
+its defaults.
 
 Examples:
   python -m kslc_jax.train                          # the laptop preset, on a GPU if there is one
-  python -m kslc_jax.train --preset debug           # seconds, to see that everything works
+  python -m kslc_jax.train --preset debug           # takes seconds: does everything work?
   python -m kslc_jax.train --robot unitree_g1       # another shipped robot, or my/robot.toml
   python -m kslc_jax.train --preset laptop --without arms --seed 1
   python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
   python -m kslc_jax.train --resume --run-dir runs/laptop-seed0
-  python -m kslc_jax.train --profile 3              # where does the time go?
+  python -m kslc_jax.train --profile 3              # trace the time of three train steps
   srun python -m kslc_jax.train --coordinator auto  # one training of all of Slurm's tasks
 """
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from jax.sharding import Mesh
 
 DEFAULT = "laptop"
-"""The preset of a training that names none."""
+"""The preset of a training without --preset."""
 
 
 @dataclass(frozen=True)
@@ -50,43 +50,45 @@ class Args:
     """xbot_l, unitree_g1, unitree_h1, booster_t1, berkeley_humanoid, or the path of a description
     (docs/own_robot.md). The preset is scaled to the robot's size."""
     without: tuple[str, ...] = ()
-    """Parts to leave out, for ablations: arms, angular-momentum, velocity-rewards,
+    """Parts of the method to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
     run_dir: Path | None = None
-    """Folder for everything; runs/PRESET-seedN if not given, with the name of another robot than
-    xbot_l in front, and with -no-PART for each ablation."""
+    """Run folder. The default is runs/PRESET-seedN; another robot than xbot_l puts its name in
+    front of PRESET, and each ablation adds -no-PART to it."""
     steps: int | None = None
-    """Environment steps in all, from the beginning of the run; 60e6 is a number, too. Short for
+    """Total environment steps, counted from the beginning of the run. You can write 60e6. Short for
     --run.steps."""
     resume: bool = False
-    """Go on from the run folder's latest checkpoint."""
+    """Continue from the run folder's latest checkpoint."""
     start_from: Path | None = None
-    """Begin a new training with this policy's networks and curriculum: a run folder, a checkpoint
-    folder, or the name of a shipped policy. A lower --ppo.learning-rate keeps what it can do."""
+    """Begin a new training with the networks and the curriculum of this policy: a run folder, a
+    checkpoint folder, or the name of a shipped policy. With a lower --ppo.learning-rate the policy
+    keeps more of its skill."""
     profile: int = 0
-    """Write the profiler's trace of this many train steps, after the first, into the run folder."""
+    """Trace this many train steps with the profiler, after the first one, into the run folder."""
     wandb: bool = False
-    """Send the records to Weights & Biases, too: pip install 'kslc_jax[wandb]'. Without an account,
+    """Also send the records to Weights & Biases: pip install 'kslc_jax[wandb]'. Without an account,
     set the environment variable WANDB_MODE=offline."""
     devices: Literal["auto"] | int = "auto"
-    """Number of this process's devices to train on. auto: as many accelerators as share the
-    environments evenly; one CPU."""
+    """Number of devices of this process to train on. auto: as many accelerators as can share the
+    environments evenly, or one CPU."""
     coordinator: str | None = None
-    """One training of several processes: host:port where process 0 can be reached, or auto where
-    Slurm, Open MPI, Kubernetes or a TPU pod tells. Each process gets the same command line, but
-    for --process-index."""
+    """Train with several processes: host:port at which process 0 can be reached. auto: Slurm, Open
+    MPI, Kubernetes or a TPU pod gives it. All processes get the same command line, except for
+    --process-index."""
     processes: int | None = None
     """Number of processes, with --coordinator host:port."""
     process_index: int | None = None
-    """Index of this process, from 0. The first one reads, writes and prints."""
+    """Index of this process, from 0. Only process 0 reads, writes and prints."""
     config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS[DEFAULT]
-    """Every number of the training, as the preset has it."""
+    """All other numbers of the training. The preset gives the defaults."""
 
 
 def join(argv: list[str]) -> None:
-    """Makes this process one of several if the command line says so; ConfigError if it cannot.
+    """Makes this process one of several if the command line says so; ConfigError if that fails.
 
-    JAX must do nothing before."""
+    Call it before JAX does anything.
+    """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("coordinator", "processes", "process-index"):
         early.add_argument(f"--{name}", f"--{name.replace('-', '_')}", dest=name)
@@ -102,7 +104,7 @@ def join(argv: list[str]) -> None:
 def cluster(
     coordinator: str | None, processes: str | None, index: str | None
 ) -> tuple[str | None, int | None, int | None]:
-    """The arguments of `devices.join` from three options; ConfigError if they make no sense."""
+    """The arguments of `devices.join` from three options; ConfigError if these do not match."""
     if (coordinator, processes, index) == ("auto", None, None):
         return None, None, None
     counts = [int(c) for c in (processes, index) if c is not None and c.isdecimal()]
@@ -117,7 +119,14 @@ def cluster(
 
 
 def parse(argv: list[str]) -> Args:
-    """Args, with `config` made of preset or stored config, ablations and overrides; ConfigError."""
+    """Reads the command line.
+
+    `Args.config` is the preset with its ablations, or on a resume the stored config. Options
+    override its fields.
+
+    Raises:
+      ConfigError: an option is wrong, or options exclude each other.
+    """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     early.add_argument("--preset")
     early.add_argument("--robot")
@@ -133,7 +142,7 @@ def parse(argv: list[str]) -> Args:
         from kslc_jax.training import run_folder
 
         base = run_folder.read_config(known.run_dir)
-    else:  # also on resume: run_folder names what the stored config has otherwise
+    else:  # also on a resume with a preset: run_folder names the first field that differs
         name, robot = known.preset or DEFAULT, known.robot or XBOT_L
         base = similar.preset(name, robot, tuple(known.without))
     args = cli.parse("train", Args, argv, __doc__, default=Args(config=base))
@@ -148,7 +157,7 @@ def parse(argv: list[str]) -> Args:
 
 
 def headline(args: Args) -> tuple[str, Path]:
-    """The training in a few words, and its run folder."""
+    """(title of the training, its run folder)."""
     if args.resume and args.run_dir is not None:
         return "resuming", args.run_dir
     name = "-no-".join([args.preset, *args.without])
@@ -159,7 +168,7 @@ def headline(args: Args) -> tuple[str, Path]:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Entry point; returns the exit code. The run folder has all numbers: output may be lost."""
+    """Entry point; returns the exit code. Lost output is no failure: the run folder has it all."""
     return cli.run(lambda: _main(sys.argv[1:] if argv is None else argv), needs_output=False)
 
 
@@ -177,7 +186,7 @@ def _main(argv: list[str]) -> int:
 
 
 def _train(args: Args, mesh: "Mesh | None") -> int:
-    """Trains; returns the exit code. With several processes, one that fails alone ends at once."""
+    """Trains; returns the exit code. If one of several processes fails alone, it exits at once."""
     from rich.console import Console
 
     from kslc_jax.training import devices, loop, run_folder
@@ -196,7 +205,7 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     how["wandb"] = args.wandb
     try:
         loop.train(args.config, run_dir, args.resume, progress, **how)
-    except NumbersError as error:  # all processes meet it
+    except NumbersError as error:  # all processes raise it
         if devices.is_first():
             raise
         return error.exit_code

@@ -1,2 +1,2 @@
-"""Judging a policy: commands that hold or change, disturbances, robots that differ, metrics of the
-gait, and the bars. Imports no training."""
+"""Trials of a policy: constant and changing commands, disturbances, varied robots, metrics of the
+gait, and the bars. Imports no training code."""

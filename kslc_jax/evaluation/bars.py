@@ -1,4 +1,4 @@
-"""The bars that a policy has to meet, read from what `kslc_jax.judge` measured. Pure Python."""
+"""The bars that a policy must meet, applied to the results of `kslc_jax.judge`. Pure Python."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -7,26 +7,26 @@ from typing import Any
 Row = dict[str, Any]
 
 TOP = 4.0
-"""Fastest command [m/s] at which nobody may fall."""
+"""Fastest command [m/s] at which no robot may fall."""
 
 GAIT_TOP = 3.5
-"""Fastest command [m/s] at which joints keep their limits and the base stays calm."""
+"""Fastest command [m/s] at which joints must keep their speed limits and the base must be calm."""
 
 PERTURBED_TOP = 3.0
-"""Fastest command [m/s] at which perturbed robots stay up."""
+"""Fastest command [m/s] at which no perturbed robot may fall."""
 
 SLOWEST = 0.5
-"""Slowest command [m/s] with a gait to judge."""
+"""Slowest command [m/s] at which the gait is judged."""
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One demand, and what came of it."""
+    """One requirement and its result."""
 
     name: str
     wanted: str
-    value: float | None  # the worst that was measured; None if nothing was
-    where: str  # where it was the worst
+    value: float | None  # the worst measured value; None if nothing was measured
+    where: str  # speed, schedule or condition of the worst value
     met: bool
 
     def shown(self) -> str:
@@ -35,11 +35,11 @@ class Bar:
 
 
 def bars(results: dict[str, Any]) -> list[Bar]:
-    """All bars.
+    """Compares the results with all bars.
 
     Args:
       results: of `judge.measure`. "speeds": rows by commanded speed; "schedules" and "perturbed":
-        rows by condition; "drake": rows, if it was asked for.
+        rows by condition; "drake": rows by commanded speed, only with --drake.
     """
     speeds: list[Row] = results["speeds"]
     gait, calm = _between(speeds, SLOWEST, TOP), _between(speeds, SLOWEST, GAIT_TOP)
@@ -65,7 +65,7 @@ def bars(results: dict[str, Any]) -> list[Bar]:
 
 
 Measured = list[tuple[float, str]]
-"""Values, and where each was measured."""
+"""(value, its speed, schedule or condition) of each measurement."""
 
 
 def _at_least(name: str, bound: float, measured: Measured) -> Bar:
@@ -87,7 +87,7 @@ def _place(row: Row) -> str:
 
 
 def _of(rows: Iterable[Row], name: str) -> Measured:
-    """A number of each row; rows in which all robots fell have none."""
+    """The metric `name` of each row. Rows in which all robots fell lack most metrics."""
     return [(row[name], _place(row)) for row in rows if name in row]
 
 

@@ -1,4 +1,4 @@
-"""Disturbances of a trial: punches at links, and arms that somebody else moves. One robot each."""
+"""Disturbances of one robot in a trial: punches at links, and arms that move at random."""
 
 import jax
 import jax.numpy as jnp
@@ -6,25 +6,25 @@ import jax.numpy as jnp
 from kslc_jax.robot import Robot
 
 PUNCH_EVERY, PUNCH_SECONDS = 4.0, 0.08
-"""Time between the starts of two punches, and duration of one [s]."""
+"""Time between the starts of two punches, and duration of a punch [s]."""
 
 ARM_RATE = 0.3
-"""Fastest motion of the targets of held arms [rad/s]."""
+"""Largest speed of the targets of held arms [rad/s]."""
 
 ARM_SECONDS = 1.0
-"""Time after which the arms' targets move on at other speeds."""
+"""Time [s] after which the arms' targets get new random speeds."""
 
 
 def punch(robot: Robot, newtons: float, key: jax.Array, steps: jax.Array, dt: float) -> jax.Array:
-    """Force and torque on every body [nbody, 6], world frame, at its centre of mass.
+    """Force [N] and torque [N m] on every body [nbody, 6], world frame, at its centre of mass.
 
-    From `PUNCH_EVERY` seconds on, a force of `newtons` acts at a random link in a random direction
-    for the first `PUNCH_SECONDS` of each interval.
+    The first punch begins after `PUNCH_EVERY` seconds, the next ones at the same interval. During a
+    punch a force acts at a random link in a random direction.
 
     Args:
-      robot: its links.
-      newtons: size of the force.
-      key: the robot's own, the same in every step.
+      robot: the robot that is hit.
+      newtons: size of the force [N].
+      key: random key of this robot, the same in every step.
       steps: [] int, control steps since the start.
       dt: control step [s].
     """
@@ -40,8 +40,10 @@ def punch(robot: Robot, newtons: float, key: jax.Array, steps: jax.Array, dt: fl
 def walk_arms(
     robot: Robot, targets: jax.Array, key: jax.Array, steps: jax.Array, dt: float
 ) -> jax.Array:
-    """Joint targets [n, rad] one control step later: each moves at a random speed up to
-    `ARM_RATE`, drawn anew every `ARM_SECONDS`, within the joint's limits."""
+    """Moves the joint targets [n, rad] on by one control step, within the joints' limits.
+
+    Each target moves at a random speed up to `ARM_RATE`. Every `ARM_SECONDS` it gets a new one.
+    """
     interval = jax.random.fold_in(key, steps // round(ARM_SECONDS / dt))
     rate = jax.random.uniform(interval, targets.shape, minval=-ARM_RATE, maxval=ARM_RATE)
     return jnp.clip(targets + rate * dt, robot.joint_lower, robot.joint_upper)

@@ -1,8 +1,8 @@
 """A second, independent engine: Drake's SAP contact solver with hydroelastic feet.
 
 The plant takes masses, frames, limits and shapes from the compiled MuJoCo model. Drake computes the
-dynamics. `step` has the signature of `physics.step`, so that a policy meets the same environment,
-signals and observations. MuJoCo only computes the kinematic sensors at Drake's state.
+dynamics. `step` has the signature of `physics.step`. So environment, signals and observations are
+the same as with MuJoCo. MuJoCo only computes the kinematic sensors at Drake's state.
 
 It needs the package drake: pip install 'kslc_jax[drake]'.
 """
@@ -41,7 +41,7 @@ from kslc_jax.randomize import Dynamics, model_fields
 from kslc_jax.robot import Robot
 
 SLAB = 0.1
-"""Depth [m] over which the floor's pressure rises from zero to `MODULUS`."""
+"""Depth [m] within which the pressure in the floor rises from zero to `MODULUS`."""
 
 MODULUS = 1e7
 """Pressure of the floor at the depth `SLAB` [Pa]. The standing robot sinks in by 0.2 mm."""
@@ -50,7 +50,7 @@ DISSIPATION = 1.0
 """Hunt-Crossley dissipation of the contact [s/m]."""
 
 FEET = ("left_foot", "right_foot")
-"""Geoms whose force on the floor is measured. Their sensors have the names FOOT_touch."""
+"""Geoms whose force on the floor is measured. The sensor of geom NAME is NAME_touch."""
 
 KINEMATICS = (
     mujoco.mj_kinematics,
@@ -62,7 +62,7 @@ KINEMATICS = (
 )
 """Stages of MuJoCo that compute its position and velocity sensors."""
 
-# Drake warns about deformable bodies at every half space; the model has none.
+# Drake warns about deformable bodies at every half space. The model has no deformable bodies.
 logging.getLogger("drake").setLevel(logging.ERROR)
 
 _lock = threading.Lock()
@@ -73,7 +73,7 @@ class World:
     """One simulated robot with fixed parameters. Each step overwrites `context` and `data`."""
 
     robot: Robot
-    data: mujoco.MjData  # for the kinematic sensors; its model is that of the plant
+    data: mujoco.MjData  # for the kinematic sensors; its model has the plant's parameters
     diagram: Diagram
     plant: MultibodyPlant
     context: Context  # of the diagram
@@ -96,7 +96,7 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     `model` is the robot's model or a changed copy. All shapes have the friction of the feet.
 
     Raises:
-      ConfigError: a robot whose frames or feet this bridge cannot pass on.
+      ConfigError: Drake cannot take over the robot's frames or feet, see `_require_plain`.
     """
     _require_plain(robot, model)
     builder = DiagramBuilder()
@@ -130,7 +130,7 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
 
 
 def _require_plain(robot: Robot, model: mujoco.MjModel) -> None:
-    """ConfigError if frames are rotated or offset, or if a foot is no single box."""
+    """ConfigError if a body has no joint, a frame is turned or shifted, or a foot is missing."""
     moved = model.body_jntnum[1:] == 0
     turned = ~np.all(np.isclose(model.body_quat[1:], [1.0, 0.0, 0.0, 0.0]), axis=1)
     shifted = np.any(model.jnt_pos != 0.0, axis=1)
@@ -239,7 +239,7 @@ def _exclude(plant: MultibodyPlant, scene: SceneGraph, model: mujoco.MjModel) ->
 
 
 def set_state(world: World, qpos: np.ndarray, qvel: np.ndarray) -> None:
-    """Puts the robot at `qpos` [7 + n] with `qvel` [6 + n], in MuJoCo's conventions."""
+    """Sets the robot's `qpos` [7 + n] and `qvel` [6 + n], given in MuJoCo's conventions."""
     q, v = np.empty(len(qpos)), np.empty(len(qvel))
     rate = np.empty(3)
     mujoco.mju_rotVecQuat(rate, qvel[3:6], qpos[3:7])
@@ -259,9 +259,9 @@ def get_state(world: World) -> tuple[np.ndarray, np.ndarray]:
 def advance(
     world: World, state: PhysicsState, target: np.ndarray, dynamics: Dynamics, steps: int
 ) -> PhysicsState:
-    """Does `steps` physics steps of one robot towards `target` [n, rad]; numpy in, numpy out.
+    """Does `steps` physics steps of one robot towards the joint targets [n, rad], in numpy.
 
-    If Drake fails in a step, qpos and qvel are NaN, like those of a diverged step in MuJoCo.
+    If Drake fails in a step, qpos and qvel are NaN, as after a diverged step in MuJoCo.
     """
     robot, actuation = world.robot, world.plant.get_actuation_input_port()
     joint_friction = world.data.model.dof_frictionloss[6:]
@@ -286,7 +286,7 @@ def advance(
 
 
 def foot_forces(world: World) -> np.ndarray:
-    """Normal force between each foot and the floor in the present state: [2], in newtons."""
+    """Normal force [2] between each foot and the floor in the present state [N]."""
     contacts = world.plant.get_contact_results_output_port().Eval(world.plant_context)
     forces = np.zeros(len(world.feet))
     for i in range(contacts.num_hydroelastic_contacts()):
@@ -298,7 +298,7 @@ def foot_forces(world: World) -> np.ndarray:
 
 
 def _sensordata(world: World, qpos: np.ndarray, qvel: np.ndarray, forces: np.ndarray) -> np.ndarray:
-    """All sensors: Drake's foot forces, and the kinematic sensors that MuJoCo computes."""
+    """All sensor values: foot forces from Drake, kinematic sensors from MuJoCo."""
     model, data = world.data.model, world.data
     data.qpos[:], data.qvel[:] = qpos, qvel
     for stage in KINEMATICS:
@@ -315,9 +315,9 @@ def step(
     dynamics: Dynamics,
     ground_friction: float,
 ) -> PhysicsState:
-    """`physics.step` in Drake: one control step of one environment.
+    """Advances one environment by one control step, as `physics.step` does, but in Drake.
 
-    Under vmap the environments take turns.
+    Under vmap it steps one environment after the other.
     """
     fields = model_fields(physics.robot_for(config), dynamics, ground_friction)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
@@ -332,9 +332,9 @@ def _host_step(
     dynamics: Dynamics,
     fields: dict[str, np.ndarray],
 ) -> PhysicsState:
-    """`step` on the host: numpy in, numpy out.
+    """The host's part of `step`, in numpy.
 
-    It must not call JAX: that call would wait for the program that waits for this callback.
+    It must not run JAX: the new computation would wait for the program that waits for this call.
     """
     state, target, dynamics, fields = jax.tree.map(
         lambda x: np.asarray(x, np.float64), (state, target, dynamics, fields)
@@ -347,7 +347,7 @@ def _host_step(
 
 @functools.lru_cache(maxsize=64)
 def _world(config: PhysicsConfig, changes: tuple[tuple[str, bytes], ...]) -> World:
-    """A `World` of the robot with some fields of its model changed; the last 64 are kept."""
+    """A `World` of the robot with changed model fields. The cache keeps the last 64 worlds."""
     robot = physics.robot_for(config)
     model = copy.copy(robot.mj_model)
     for name, raw in changes:

@@ -1,9 +1,9 @@
 """Metrics of a robot's motion, from a `Trace`, in numpy.
 
-All functions take the trace of one commanded speed, [T, N, ...], and use the time after `SETTLE`. A
-trial that fell counts as 0 m/s in `forward_mean` and `forward_rmse`; the metrics of speed
-variation, effort, strides, symmetry and momentum leave it out. `summary` joins all metrics. Angular
-momenta are about the whole-body centre of mass (paper, Eq. 3).
+All functions take the trace [T, N, ...] of one commanded speed, and use the time after `SETTLE`. A
+trial with a fall counts as 0 m/s in `forward_mean` and `forward_rmse`. The metrics of speed
+variation, effort, strides, symmetry and momentum leave such trials out. `summary` joins all
+metrics. Angular momenta are about the whole-body centre of mass (paper, Eq. 3).
 """
 
 import mujoco
@@ -15,23 +15,23 @@ from kslc_jax.robot import Robot
 
 GRAVITY = 9.81
 SETTLE = 2.0
-"""Seconds at the start that do not count, because the robot gathers speed."""
+"""Time [s] at the start of a trial that does not count: the robot still gathers speed."""
 
 RESTING = 0.1
-"""Mean forward speed [m/s]. At or below it, cost of transport and stride length are not defined."""
+"""Mean forward speed [m/s] up to which cost of transport and stride length are not defined."""
 
 RANGES = {"leg_pitch": "hip", "knee": "knee", "shoulder_pitch": "shoulder"}
 """Metrics of joint ranges, and the roles of their joints."""
 
 MOMENTUM_EVERY = 0.05
-"""Seconds between two samples of the limbs' angular momentum."""
+"""Time [s] between two samples of the limbs' angular momentum."""
 
 CHATTER = 0.05
-"""Seconds. A foot that leaves the ground for a shorter time counts as still on it."""
+"""A foot that leaves the ground for less than this time [s] counts as still on the ground."""
 
 
 def _steady(trace: Trace, dt: float) -> Trace:
-    """The part of the trace after `SETTLE`, for the trials that did not fall."""
+    """The part of the trace after `SETTLE`, of the trials without a fall."""
     start = round(SETTLE / dt)
     upright = trace.alive[-1]
     fields = {n: getattr(trace, n)[start:, upright] for n in trace.__dataclass_fields__}
@@ -39,7 +39,7 @@ def _steady(trace: Trace, dt: float) -> Trace:
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    """Correlation over time of two signals [T, N], as a mean over trials; 0 for constant ones."""
+    """Correlation over time of two signals [T, N], mean over trials. A constant signal gives 0."""
     a, b = a - a.mean(0), b - b.mean(0)
     scale = np.sqrt((a**2).sum(0) * (b**2).sum(0))
     return float(np.mean(np.where(scale > 1e-6, (a * b).sum(0) / np.maximum(scale, 1e-6), 0.0)))
@@ -65,7 +65,7 @@ def _interval(name: str, per_trial: np.ndarray) -> dict[str, float]:
 def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
     """Survival and velocity tracking.
 
-    The mean forward velocity is the paper's measure; a trial that fell counts as 0 m/s.
+    The paper measures the mean forward velocity. Here a trial with a fall counts as 0 m/s.
     """
     start = round(SETTLE / dt)
     upright = trace.alive[-1]
@@ -124,7 +124,8 @@ def effort(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 def _touchdowns(contact: np.ndarray, dt: float) -> np.ndarray:
     """Number of landings [N, 2] in a contact record [T, N, 2].
 
-    A foot that chatters lands once. A foot on the ground at the start has not landed.
+    A foot that chatters (see `CHATTER`) lands once. A foot that starts on the ground has not
+    landed.
     """
     window = round(CHATTER / dt)
     padded = np.pad(contact, ((window, 0), (0, 0), (0, 0)), mode="edge")
@@ -183,7 +184,7 @@ def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 
 
 def _bodies_of(robot: Robot, part: str) -> np.ndarray:
-    """[bodies] bool, True for the bodies of the limbs of this kind, "arm" or "leg"."""
+    """Mask [bodies] bool of the bodies that belong to the limbs `part`, "arm" or "leg"."""
     first = [
         robot.link_body_ids[1 + joints[0]]
         for limb, joints in robot.anatomy.limbs.items()
@@ -213,8 +214,8 @@ def body_momentum(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
     """RMS angular momentum [kg m^2/s] of the whole body, of the arms and of the legs.
 
-    Each has two values: of the whole vector, and of its vertical component. Arms and legs are
-    computed with the masses of the nominal model, without a payload.
+    Each part has two values: one of the whole vector, one of its vertical component. The values of
+    arms and legs use the masses of the nominal model, without a payload.
     """
     s = _steady(trace, dt)
     squares = (s.angular_momentum**2).mean((0, 1))
@@ -246,7 +247,7 @@ def momentum(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 
 
 def summary(trace: Trace, command: float, robot: Robot, dt: float) -> dict[str, float]:
-    """All metrics. If every trial fell, only those of `speed`."""
+    """All metrics. If every trial had a fall, only those of `speed`."""
     out = speed(trace, command, dt)
     if out["survival"] == 0.0:
         return out

@@ -1,4 +1,4 @@
-"""Metrics of a policy at each commanded speed, over many trials."""
+"""Runs trials at each commanded speed, and computes the metrics of each speed."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,7 +13,8 @@ from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
 
 MOST_SAMPLES = 2_000_000
-"""Most control steps, over all trials, that memory holds at once: about 300 bytes each."""
+"""Largest number of control steps, over all trials, in memory at once. Each takes about 300 bytes.
+"""
 
 Describe = Callable[[Trace, float, Robot, float], dict[str, float]]
 """(trace, command [m/s], robot, control step [s]) -> metrics by name."""
@@ -37,10 +38,10 @@ def measure(
       setting: conditions.
       speeds: commanded forward speeds [m/s].
       seeds: trials per command.
-      seed: of initial states and randomisation.
+      seed: seed of initial states and randomisation.
       progress: called with the share [] that is done.
       describe: computes the metrics of a trace; the default is `gait_metrics.summary`.
-      vy, yaw_rate: commanded with every speed, positive to the left [m/s, rad/s].
+      vy, yaw_rate: commanded together with every speed, positive to the left [m/s, rad/s].
     """
     describe = describe or gait_metrics.summary
     robot, dt = physics.robot_for(setting.physics), setting.physics.control_dt

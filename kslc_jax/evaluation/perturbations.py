@@ -1,5 +1,7 @@
-"""Perturbations by name: friction=0.3, payload=5, links=0.1, ... and what they change. Imports no
-JAX: a command line is checked before anything heavy starts."""
+"""Perturbations by name (friction=0.3, payload=5, links=0.1, ...) and the settings they change.
+
+Imports no JAX, so that a command checks its arguments quickly.
+"""
 
 import dataclasses
 import math
@@ -10,18 +12,18 @@ from typing import Any
 from kslc_jax.config import ConfigError, RandomizeConfig
 
 MOST_INSET = 0.04
-"""Largest `sole` [m]: soles keep some area."""
+"""Largest `Variation.sole` [m]. It leaves the soles some area."""
 
 
 @dataclass(frozen=True)
 class Variation:
-    """By how much robots differ; 0 is the described robot."""
+    """Sizes of the differences between a robot and its description; 0: no difference."""
 
     hands: float = 0.0
     """Mass added at each hand [kg]."""
     sole: float = 0.0
-    """Each side of a sole lies up to this far inside the foot's outline [m], anew every control
-    step."""
+    """Largest distance [m] of each side of a sole from the foot's outline, inwards. It is drawn
+    anew at every control step."""
     joints: float = 0.0
     """Largest Coulomb friction [N m] and largest damping [N m s/rad] added to each joint."""
 
@@ -34,7 +36,7 @@ class Variation:
 
 
 PUSH_SECONDS = 4.0
-"""Time between pushes."""
+"""Time between two pushes [s]."""
 
 PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
     "friction": lambda mu: {"friction": (mu, mu), "ground_friction": mu},
@@ -54,7 +56,7 @@ PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
     "joints": lambda most: {"variation": Variation(joints=most)},
     "heading": lambda yaw: {"heading": yaw},
 }
-"""Name -> changes of RandomizeConfig or trials.Setting for a value."""
+"""Name -> (value -> changed fields of `RandomizeConfig` or of `trials.Setting`)."""
 
 ALL = (
     *("friction=0.3", "friction=0.6", "friction=1.5"),
@@ -62,15 +64,21 @@ ALL = (
     *("gains=0.85", "gains=1.15", "strength=0.9", "imu=0.03"),
     *("links=0.1", "hands=0.5", "sole=0.02", "joints=1"),
 )
-"""What `--perturb all` runs."""
+"""The conditions of `--perturb all`."""
 
 ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
-"""Changes that belong in `trials.Setting.randomize`."""
+"""Names of the changes that belong in `trials.Setting.randomize`."""
 
 
 def changes(condition: str) -> dict[str, Any]:
-    """Changes that 'nominal' or a perturbation such as 'payload=5' makes; ConfigError if
-    unknown."""
+    """The fields that a condition changes, with their values.
+
+    Args:
+      condition: 'nominal', or a perturbation such as 'payload=5'.
+
+    Raises:
+      ConfigError: the condition is unknown, or its value is out of range.
+    """
     if condition == "nominal":
         return {}
     name, _, value = condition.partition("=")
@@ -88,8 +96,10 @@ def changes(condition: str) -> dict[str, Any]:
 
 
 def settings(made: dict[str, Any], randomize: RandomizeConfig) -> dict[str, Any]:
-    """Fields of `trials.Setting` for the `changes` of a condition, to robots that else are as
-    `randomize` says."""
+    """Fields of `trials.Setting` for the `changes` of a condition.
+
+    The fields of `randomize` that the condition does not change keep their values.
+    """
     robot = {name: value for name, value in made.items() if name in ROBOT}
     rest = {name: value for name, value in made.items() if name not in ROBOT}
     return rest | {"randomize": dataclasses.replace(randomize, **robot)}

@@ -1,7 +1,8 @@
-"""How robots react to commands that change: numbers from a `Trace` of a schedule, in numpy.
+"""Metrics of the reaction to changing commands, from a `Trace` of a schedule, in numpy.
 
-A change is the start of a leg of the schedule. Speeds are smoothed over `WINDOW`, about a gait
-cycle. Legs count up to a fall; the leg in which a robot falls counts in survival alone.
+A schedule is a sequence of legs, see `schedules`. A change is the start of a leg. Speeds are
+averaged over `WINDOW`, about one gait cycle. The leg in which a robot falls counts only in the
+survival.
 """
 
 import dataclasses
@@ -13,38 +14,38 @@ import numpy as np
 from kslc_jax.evaluation.trials import Trace
 
 WINDOW = 0.5
-"""Seconds over which velocities are averaged."""
+"""Time [s] over which velocities are averaged."""
 
 AFTER = 2.0
-"""Seconds after a change over which the tracking error is averaged."""
+"""Time [s] after a change over which the tracking error is averaged."""
 
 SETTLED = 0.15, 0.1
-"""A robot has settled once its velocity error stays below the larger of these: m/s, and share of
-the change."""
+"""Limits of the velocity error: in m/s, and as a share of the change of the command. A robot has
+settled when its error stays below the larger one."""
 
 AT_REST = 0.15
-"""Speed over ground [m/s] below which a robot has stopped."""
+"""Speed over ground [m/s]. A robot that is slower has stopped."""
 
 FROM = 0.5
-"""Commanded speed before a stop [m/s] from which stops count."""
+"""Least commanded speed [m/s] before a stop, for the stop to count."""
 
 SHOWN, SHOWN_EVERY = 3, 0.1
-"""Robots whose speed is kept for the figure, and the time between its samples [s]."""
+"""Number of robots whose speed the figure shows, and time between two samples [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Change:
-    """A command that came after another one, of one robot."""
+    """Reaction of one robot to one change of its command."""
 
-    error: float  # m/s, mean over the first `AFTER` seconds
-    settle: float | None  # s; None if the leg ended before
-    stop: tuple[float, float] | None  # s and m until at rest; None if it was no stop, or none yet
-    drift: float | None  # m/s over ground once at rest
-    stops: bool  # whether it was a stop from a run
+    error: float  # m/s, mean velocity error over the first `AFTER` seconds
+    settle: float | None  # s until settled; None if the leg ended before
+    stop: tuple[float, float] | None  # s and m until at rest; None if not a stop, or not at rest
+    drift: float | None  # m/s, mean speed over ground after the stop
+    stops: bool  # True if the command is to stop, from at least `FROM`
 
 
 def summary(trace: Trace, dt: float) -> dict[str, float]:
-    """Survival, and the reaction to changes, as means over all of them.
+    """Survival, and metrics of the reaction, each a mean over all changes.
 
     Keys: survival, seconds_to_fall, changes (per robot), change_error [m/s], settle_seconds,
     settled (share of the changes), stop_seconds, stop_metres, stop_metres_most, stopped (share of
@@ -85,8 +86,11 @@ def _mean(name: str, values: list) -> dict[str, float]:
 
 
 def falls(trace: Trace, dt: float) -> list[dict]:
-    """Each fall: robot, time [s], seconds since the last change, and the commanded vx and vy [m/s]
-    before and after that change."""
+    """One entry per fall.
+
+    Keys: robot (index), seconds (time of the fall), after (seconds since the last change), from
+    and to (commanded vx, vy [m/s] before and after that change).
+    """
     alive, command, leg = (np.asarray(x) for x in (trace.alive, trace.command, trace.leg))
     out = []
     for i in np.flatnonzero(~alive[-1]):
@@ -107,7 +111,7 @@ def falls(trace: Trace, dt: float) -> list[dict]:
 
 
 def series(trace: Trace, dt: float) -> dict[str, Any]:
-    """Commanded and actual forward speed of the first robots for the figure; None from a fall."""
+    """Commanded and actual forward speed [m/s] of the first robots; None from a fall on."""
     every = round(SHOWN_EVERY / dt)
     alive = np.asarray(trace.alive)[::every, :SHOWN].T
     actual = np.asarray(trace.linvel)[::every, :SHOWN, 0].T
@@ -123,7 +127,7 @@ def series(trace: Trace, dt: float) -> dict[str, Any]:
 
 
 def _changes(trace: Trace, robot: int, dt: float) -> list[Change]:
-    """All changes that one robot lived through, without the start from rest."""
+    """All changes that one robot survived, without the start from rest."""
     end = int(np.asarray(trace.alive)[:, robot].sum())
     fell = end < len(trace.alive)
     leg = np.asarray(trace.leg)[:end, robot]
@@ -140,8 +144,14 @@ def _changes(trace: Trace, robot: int, dt: float) -> list[Change]:
 
 
 def _change(velocity: np.ndarray, command: np.ndarray, position: np.ndarray, dt: float) -> Change:
-    """One leg: velocity [T, 2], position [T, 2], and the command [1 + T, 2] from the step before
-    it on."""
+    """The reaction within one leg of T steps.
+
+    Args:
+      velocity: [T, 2] m/s.
+      command: [1 + T, 2] m/s; the first row is the command of the leg before.
+      position: [T, 2] m, world frame.
+      dt: control step [s].
+    """
     size = float(np.linalg.norm(command[1] - command[0]))
     error = np.linalg.norm(_smooth(velocity - command[1:], dt), axis=-1)
     least, share = SETTLED
@@ -163,7 +173,7 @@ def _change(velocity: np.ndarray, command: np.ndarray, position: np.ndarray, dt:
 
 
 def _settle(near: np.ndarray, dt: float) -> float | None:
-    """Seconds from which on it is near to the end; None if it is not near at the end."""
+    """Time [s] from which on `near` [T] is True to the end; None if its last value is False."""
     if not near[-1]:
         return None
     away = np.flatnonzero(~near)
@@ -171,7 +181,7 @@ def _settle(near: np.ndarray, dt: float) -> float | None:
 
 
 def _smooth(values: np.ndarray, dt: float) -> np.ndarray:
-    """Moving average of [T, 2] over `WINDOW`, centred; shorter at the ends."""
+    """Centred moving average of values [T, 2] over `WINDOW`. At the ends the window is shorter."""
     half = round(WINDOW / dt) // 2
     total = np.cumsum(np.concatenate([np.zeros((1, 2)), values]), axis=0)
     at = np.arange(len(values))

@@ -1,4 +1,4 @@
-"""Trials of a policy under schedules: rows of numbers, and their table."""
+"""Trials of a policy under schedules, and the table of their metrics."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,7 +24,7 @@ COLUMNS = (
     ("drift", "drift at rest [m/s]", "{:.3f}"),
     ("yaw_rate_std", "yaw std", "{:.2f}"),
 )
-"""(name, label, form) of the numbers in the table."""
+"""(metric, heading, format) of each column of the table."""
 
 
 def measure(
@@ -35,15 +35,15 @@ def measure(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[dict[str, Any]]:
-    """One row per schedule: numbers of `reaction.summary`, its falls, and a few robots' speeds.
+    """One row per schedule: metrics of `reaction.summary`, falls, and the speeds of a few robots.
 
     Args:
-      policy: who is tried.
-      setting: conditions; its schedule is replaced.
-      schedules: what is commanded.
+      policy: acts deterministically.
+      setting: conditions; `schedules` replaces its schedule.
+      schedules: commands over time.
       robots: trials per schedule.
-      seed: of initial states, robots and drawn commands.
-      progress: told the share that is done.
+      seed: seed of initial states, robots and drawn commands.
+      progress: called with the share [] that is done.
     """
     dt, rows = setting.physics.control_dt, []
     for i, schedule in enumerate(schedules):
@@ -61,7 +61,7 @@ def measure(
 
 
 def table(results: dict[str, list[dict[str, Any]]], title: str):
-    """All schedules under all conditions as one rich table; * is beyond the training."""
+    """All schedules under all conditions as one rich table. * marks rows beyond the training."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -72,7 +72,7 @@ def table(results: dict[str, list[dict[str, Any]]], title: str):
     out.add_column("condition")
     out.add_column("schedule")
     for _, label, _ in COLUMNS:
-        out.add_column(escape(label), justify="right")  # rich would take [m/s] for a style
+        out.add_column(escape(label), justify="right")  # rich would read [m/s] as a style
     for condition, rows in results.items():
         for row in rows:
             cells = [form.format(row[name]) if name in row else "-" for name, _, form in COLUMNS]

@@ -1,7 +1,7 @@
 """Commands that change during a trial.
 
-A schedule is a sequence of legs, one command each. The next leg of a robot is a pure function of
-(schedule, leg number, key, yaw, position); `trials` steps it inside its scan.
+A schedule is a sequence of legs. Each leg has one command. The next leg of a robot is a pure
+function of (schedule, leg number, key, yaw, position). `trials` calls it inside its scan.
 """
 
 import dataclasses
@@ -23,14 +23,14 @@ NAMES = ("stop", "reverse", "box", "random", "jitter", "turns", "tour")
 """The built-in schedules, see `named`."""
 
 RUN, REST = 5.0, 4.0
-"""Seconds at the top speed, and seconds at rest or in reverse, of `stop` and `reverse`."""
+"""Durations [s] of the legs of `stop` and `reverse`: at the top speed; at rest or in reverse."""
 
 BLOCK = 5
-"""Legs in a block of `random` and `jitter`: the last but one runs at the top speed, the last stops
-or reverses, the others are drawn as training draws commands."""
+"""Legs in a block of `random` and `jitter`. The last but one runs at the top speed. The last one
+stops or reverses. The others have random commands, drawn as in training."""
 
 REVERSALS = 1 / 3
-"""Share of the blocks that end with a reversal; the others end with a stop."""
+"""Share of the blocks that end with a reversal. The others end with a stop."""
 
 TURNS = (0.25, 0.5, 0.75)
 """Speeds of `turns`, as shares of the top speed."""
@@ -45,12 +45,12 @@ APPROACH, CRAWL = 0.6, 0.5
 """Near a way-point: speed per distance [1/s], and least speed [m/s]."""
 
 PATIENCE = 60.0
-"""Seconds after which `tour` gives a way-point up."""
+"""Time [s] after which `tour` gives up a way-point and draws another one."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One command of a list."""
+    """One command in a list of commands."""
 
     seconds: float
     vx: float  # m/s
@@ -61,43 +61,43 @@ class Step:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Commands over time: a list that starts over at its end, drawn ones, or a tour."""
+    """Commands over time: a list that repeats, random commands, or a tour of way-points."""
 
     name: str
     top: float  # m/s, the fastest command
-    low: float = 0.0  # m/s, the slowest one
-    top_width: float = 0.0  # m/s, of the range from which training draws its top commands
-    steps: tuple[Step, ...] = ()  # the list; empty if the commands are drawn
-    seconds: tuple[float, float] = (PATIENCE, PATIENCE)  # shortest and longest drawn leg
-    brakes: bool = False  # some of the drawn legs run at the top speed, then stop or reverse
-    tour: bool = False
+    low: float = 0.0  # m/s, the slowest command; negative: backwards
+    top_width: float = 0.0  # m/s, width of the range from which training draws its top commands
+    steps: tuple[Step, ...] = ()  # the list; empty for random commands and for a tour
+    seconds: tuple[float, float] = (PATIENCE, PATIENCE)  # shortest and longest random leg
+    brakes: bool = False  # True: random legs come in blocks with a brake at the end, see `BLOCK`
+    tour: bool = False  # True: the robot heads for random way-points
 
 
 @flax.struct.dataclass
 class Leg:
-    """The command in force, of one robot."""
+    """The present leg of one robot."""
 
     number: jax.Array  # [] int, from 0
-    left: jax.Array  # [] s until the leg ends
+    left: jax.Array  # [] s, time until the leg ends
     velocity: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
-    heading: jax.Array  # [] rad, world, wanted while no yaw rate is
-    point: jax.Array  # [2] m, world, the next way-point; NaN without one
+    heading: jax.Array  # [] rad, world, commanded while the commanded yaw rate is 0
+    point: jax.Array  # [2] m, world, the next way-point; NaN if there is none
 
 
 # -------------------------------------------------------------------------------------- schedules
 
 
 def named(name: str, config: Config, v_max: float, top: float | None = None) -> Schedule:
-    """The schedule NAME, or that of a JSON file of this path.
+    """The built-in schedule of this name, or the schedule in a JSON file.
 
     Args:
       name: one of `NAMES`, or the path of a list of {seconds, vx, vy, yaw_rate or heading}.
-      config: of the policy; commands are drawn as its training draws them.
-      v_max: fastest command that the policy was trained for [m/s].
-      top: fastest command of the schedule [m/s]; None takes `v_max`.
+      config: the policy's config; random commands are drawn as in its training.
+      v_max: fastest command of the policy's training [m/s].
+      top: fastest command of the schedule [m/s]. None: `v_max`; a file keeps its own speeds.
 
     Raises:
-      ConfigError: no such name, or no such file, or a file that is no schedule.
+      ConfigError: there is no such name or file, or the file holds no schedule.
     """
     fastest, low = (v_max if top is None else top), config.curriculum.v_min
     blank = Schedule(name, top=fastest, low=low, top_width=config.curriculum.v_step)
@@ -122,8 +122,10 @@ def named(name: str, config: Config, v_max: float, top: float | None = None) -> 
 
 
 def _turns(config: CommandConfig, top: float) -> tuple[Step, ...]:
-    """At each of three speeds straight on, to the left and to the right, as fast as training asks
-    a robot at that speed to turn."""
+    """Steps of `turns`: at each speed straight on, then to the left, then to the right.
+
+    The yaw rate is the largest one that training commands at that speed.
+    """
     steps = []
     for share in TURNS:
         vx = share * top
@@ -134,7 +136,7 @@ def _turns(config: CommandConfig, top: float) -> tuple[Step, ...]:
 
 
 def _read(path: Path, top: float | None) -> Schedule:
-    """A user's schedule, its speeds limited to `top`."""
+    """Reads a user's schedule. `top` [m/s], if given, limits its forward speeds."""
     try:
         content = json.loads(path.read_text())
     except OSError:
@@ -171,7 +173,7 @@ def _step(path: Path, index: int, entry: Any) -> Step:
 
 
 def constant(velocity: jax.Array, heading: jax.Array | float) -> Leg:
-    """The one leg [3] of a trial without a schedule."""
+    """The only leg of a trial without a schedule: `velocity` [3], `heading` [rad]."""
     return Leg(
         number=jnp.zeros((), jnp.int32),
         left=jnp.zeros(()),
@@ -182,7 +184,7 @@ def constant(velocity: jax.Array, heading: jax.Array | float) -> Leg:
 
 
 def before_start(heading: jax.Array | float) -> Leg:
-    """What a robot of this starting heading [rad] has before its first leg."""
+    """A finished leg that stands before the first leg of a schedule; `heading` [rad]."""
     return constant(jnp.zeros(3), heading).replace(number=jnp.full((), -1, jnp.int32))
 
 
@@ -195,16 +197,16 @@ def update(
     position: jax.Array,
     dt: float,
 ) -> Leg:
-    """The leg in force for the next `dt` [s].
+    """The leg for the next `dt` seconds: the present one, or the next one if it has ended.
 
     Args:
-      schedule: static.
-      config: how training draws commands.
-      leg: of the last step.
-      key: the robot's own, the same in every step.
-      yaw: where the robot heads now [rad].
-      position: [2] where it is [m], world.
-      dt: time between calls [s].
+      schedule: the schedule (static under jit).
+      config: distribution of the commands in training.
+      leg: the leg of the last step.
+      key: random key of this robot, the same in every step.
+      yaw: present heading of the robot [rad].
+      position: [2] present position of the robot in the world [m].
+      dt: time between two calls [s].
     """
     reached = jnp.hypot(*(leg.point - position)) < REACHED  # False for NaN
     over = (leg.left < 0.5 * dt) | reached
@@ -247,7 +249,7 @@ def _drawn(schedule: Schedule, config: CommandConfig, leg: Leg, key, yaw: jax.Ar
     sampled = commands.sample(config, keys[0], (low, top), yaw, schedule.top_width)
     reverses = jax.random.bernoulli(keys[1], REVERSALS)
     straight = jnp.where(fast, top, jnp.where(reverses, low, 0.0)) * jnp.array([1.0, 0.0, 0.0])
-    drawn = sampled.velocity.at[2].set(0.0)  # the heading says where to turn
+    drawn = sampled.velocity.at[2].set(0.0)  # the heading alone decides the turn
     special = fast | brakes
     seconds = jax.random.uniform(keys[2], minval=shortest, maxval=longest)
     return leg.replace(
@@ -258,7 +260,7 @@ def _drawn(schedule: Schedule, config: CommandConfig, leg: Leg, key, yaw: jax.Ar
 
 
 def _next_point(leg: Leg, key: jax.Array, yaw: jax.Array, position: jax.Array) -> Leg:
-    """A way-point anywhere around the robot."""
+    """A leg to a random way-point around the robot, at a distance from `NEAR` to `FAR`."""
     key_bearing, key_distance = jax.random.split(key)
     bearing = jax.random.uniform(key_bearing, minval=-jnp.pi, maxval=jnp.pi)
     distance = jax.random.uniform(key_distance, minval=NEAR, maxval=FAR)
@@ -267,7 +269,7 @@ def _next_point(leg: Leg, key: jax.Array, yaw: jax.Array, position: jax.Array) -
 
 
 def _towards(schedule: Schedule, leg: Leg, yaw: jax.Array, position: jax.Array) -> Leg:
-    """Heads for the way-point; slow near it, and while it is not ahead."""
+    """Commands the robot towards its way-point: slowly near it, and while it is not ahead."""
     way = leg.point - position
     heading = jnp.arctan2(way[1], way[0])
     ahead = jnp.clip(jnp.cos(maths.wrap_angle(heading - yaw)), 0.0, 1.0)

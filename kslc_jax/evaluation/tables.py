@@ -36,17 +36,16 @@ SIDEWAYS_COLUMNS: Columns = (
     ("yaw_rate_mean", "mean yaw rate [rad/s]", "{:.2f}"),
     *HEADLINE[3:],
 )
-"""Columns for commands with a side step or a turn: mean vy and mean yaw rate follow mean vx."""
+"""Columns for commands with a side step or a turn. They add mean vy and mean yaw rate."""
 
 
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
-    """The numbers of those columns, one line per commanded speed. A row with `beyond` in it gets an
-    asterisk."""
+    """A table with one line per commanded speed. An asterisk marks rows with the entry `beyond`."""
     marked = any("beyond" in row for row in rows)
     caption = "* beyond what the policy was trained for" if marked else None
     out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for label in ("command [m/s]", *(label for _, label, _ in columns)):
-        out.add_column(escape(label), justify="right")  # rich would take [m/s] for a style
+        out.add_column(escape(label), justify="right")  # rich would read [m/s] as a style
     for row in rows:
         cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
         out.add_row(f"{row['command']:.1f}" + "*" * ("beyond" in row), *cells)
@@ -54,5 +53,5 @@ def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table
 
 
 def console() -> Console:
-    """A console as wide as the terminal. Without a terminal it is wide enough for the table."""
+    """A console as wide as the terminal; without a terminal, as wide as the table needs."""
     return Console(highlight=False, width=None if sys.stdout.isatty() else 180)

@@ -1,4 +1,4 @@
-"""Conditions of a trial that lie beyond those a policy was trained for."""
+"""Compares the conditions of a trial with the conditions that the policy was trained for."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -10,20 +10,20 @@ from kslc_jax.evaluation.trials import Setting
 from kslc_jax.policy import Policy
 
 TOLERANCE = 1e-6
-"""Numbers this close to the end of a range lie in it."""
+"""Numbers that exceed a range by at most this still lie in the range."""
 
 RANGES = ("base_mass", "base_com", "kp", "kd", "motor_strength", "joint_friction")
-"""Fields of RandomizeConfig that are compared as they are."""
+"""Fields of RandomizeConfig whose ranges are compared directly."""
 
 
 def beyond(
     policy: Policy, setting: Setting, command: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> dict[str, list[str]]:
-    """{"beyond": reasons} where a trial asks for more than the training had; {} where it does not.
+    """{"beyond": reasons} if a trial goes beyond the training conditions, else {}.
 
     Args:
-      policy: its config and its curriculum say what it was trained for.
-      setting: conditions; with a schedule that says what is commanded.
+      policy: its config and curriculum give the training conditions.
+      setting: conditions of the trial; its schedule, if any, gives the commands.
       command: vx, vy [m/s], yaw rate [rad/s] of a trial without a schedule.
     """
     trained, v_max = policy.config, float(policy.curriculum.v_max)
@@ -50,7 +50,7 @@ def _commanded(schedule: Schedule, trained: Config) -> list[tuple[float, float, 
 
 
 def _pace(schedule: Schedule) -> float:
-    """Seconds of the shortest leg."""
+    """Duration of the shortest leg [s]."""
     return min((step.seconds for step in schedule.steps), default=schedule.seconds[0])
 
 

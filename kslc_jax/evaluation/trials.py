@@ -1,5 +1,7 @@
-"""Trials: a trained policy under fixed or changing commands, in the environment it was trained in
-or in full C MuJoCo at high fidelity. One code path for both: only the physics config differs.
+"""Trials of a trained policy under constant or changing commands.
+
+A trial runs in the policy's training physics, or in full C MuJoCo at high fidelity. Both use the
+same code with another physics config.
 """
 
 import dataclasses
@@ -23,7 +25,7 @@ from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
 
 AS_DESCRIBED = Variation()
-"""The described robot."""
+"""No difference between the robot and its description."""
 
 NOMINAL = RandomizeConfig(
     friction=(1.0, 1.0), ground_friction=1.0, base_mass=(0.0, 0.0), push_seconds=0.0
@@ -32,46 +34,46 @@ NOMINAL = RandomizeConfig(
 
 
 FARTHEST = 3.0
-"""How far [rad] a wanted heading lies ahead of the robot at most."""
+"""Largest angle [rad] from the robot's heading to the commanded one. It must be below pi."""
 
 
 FOREVER = 864_000.0
-"""Time [s] that no trial and no session lasts: ten days."""
+"""Ten days [s], longer than any trial or session."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Under what conditions a policy is tried."""
+    """Conditions of a trial."""
 
     physics: PhysicsConfig
     randomize: RandomizeConfig = NOMINAL
     seconds: float = 20.0
     noise: bool = False
-    """Sensor noise, action delay and action noise, the most that training has."""
+    """True: sensor noise, action delay and action noise at the full level of training."""
     latency: int = 0
-    """Control steps by which every action comes late."""
+    """Number of control steps by which every action is delayed."""
     imu_offset: tuple[float, float] = (0.0, 0.0)
     """Constant error of the roll and pitch that the policy sees [rad]."""
     simulate: Callable[..., physics.PhysicsState] | None = None
-    """Another engine, with the signature of `physics.step`; None takes that of `physics`."""
+    """Another engine, with the signature of `physics.step`; None: the engine of `physics`."""
     schedule: Schedule | None = None
-    """Commands that change; None holds one command per robot."""
+    """Commands that change; None: one constant command per robot."""
     heading: float = 0.0
-    """Where the robot heads at the start, and until a command says otherwise [rad]."""
+    """Heading [rad] at the start. It is also the commanded heading until a schedule changes it."""
     punch: float = 0.0
-    """Force [N] at a random link every `disturbances.PUNCH_EVERY` seconds."""
+    """Force [N] of the punches, see `disturbances.punch`; 0: no punches."""
     hold_arms: bool = False
-    """The arms' targets walk at random, whatever the policy asks for."""
+    """True: the arms follow random targets in place of the policy's actions."""
     variation: Variation = AS_DESCRIBED
-    """How robots differ beside `randomize`."""
+    """Differences between the robots beyond those of `randomize`."""
 
 
 @flax.struct.dataclass
 class Trace:
-    """What was recorded, [T, N, ...]; nothing counts from a fall on, where `alive` is False."""
+    """Recorded values, [T, N, ...]. From a fall on they do not count: `alive` is then False."""
 
     alive: jax.Array  # bool
-    mass: jax.Array  # kg, of the robot and what it carries
+    mass: jax.Array  # kg, of the robot with its payload
     qpos: jax.Array  # [7 + n]
     linvel: jax.Array  # [3] m/s, base frame
     angvel: jax.Array  # [3] rad/s, base frame
@@ -81,32 +83,32 @@ class Trace:
     contact: jax.Array  # [2] bool, left and right foot
     foot_height: jax.Array  # [2] m, ankle-roll link
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
-    command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s] that the step was done under
+    command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s] during the step
     leg: jax.Array  # int, number of the schedule's leg
 
 
 @flax.struct.dataclass
 class Trial:
-    """What a trial carries from step to step, of one robot."""
+    """State of one robot's trial between two control steps."""
 
     env: env.EnvState
     alive: jax.Array  # [] bool
-    queue: jax.Array  # [latency, n] actions that are still to come, the next one first
+    queue: jax.Array  # [latency, n] delayed actions, the next one first
     leg: Leg
-    arms: jax.Array  # [n] rad, targets of held arms
+    arms: jax.Array  # [n] rad, joint targets of held arms
     body: Body
-    key: jax.Array  # the robot's own
+    key: jax.Array  # random key of this robot
     steps: jax.Array  # [] int, control steps done
 
 
 def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
-    """The physics that the policy was trained in ("train") or the high-fidelity one."""
+    """The physics config: that of the policy's training ("train"), or high fidelity ("high")."""
     trained = policy.config.physics
     return HighFidelity(robot=trained.robot) if fidelity == "high" else trained
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
-    """The policy's config under the setting's conditions: fixed commands, no time limit."""
+    """The policy's config, changed to the setting's conditions: fixed commands, no time limit."""
     quiet = {} if setting.noise else {"noise_level": 0.0, "action_delay": 0.0, "action_noise": 0.0}
     return dataclasses.replace(
         config,
@@ -144,10 +146,11 @@ def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> e
 def with_command(
     config: Config, state: env.EnvState, velocity: jax.Array, heading: jax.Array | float = 0.0
 ) -> env.EnvState:
-    """The environment under the command `velocity` [3]: vx, vy [m/s], yaw rate [rad/s].
+    """Gives the environment the command `velocity` [3]: vx, vy [m/s], yaw rate [rad/s].
 
-    A wanted yaw rate moves the heading ahead of the robot, by less than half a turn, beyond which
-    it would turn the other way; without one it is `heading` [rad].
+    A yaw rate other than 0 sets the commanded heading ahead of the robot, by at most `FARTHEST`:
+    beyond half a turn the robot would turn the other way. With a yaw rate of 0 the commanded
+    heading is `heading` [rad].
     """
     yaw = signals.read(physics.robot_for(config.physics), state.physics).base_euler[2]
     ahead = yaw + jnp.clip(velocity[2] / config.command.heading_gain, -FARTHEST, FARTHEST)
@@ -159,26 +162,27 @@ def with_command(
 def run(
     policy: Policy, setting: Setting, velocities: np.ndarray, seed: int = 0, chunk: float = 1.0
 ) -> Iterator[Trace]:
-    """Tries one command per environment; yields the trace in pieces of `chunk` seconds.
+    """Runs N robots, each under its own command. Yields the trace in pieces of `chunk` seconds.
 
-    The command holds from the first step on; the one frame before it, the reset's, shows whatever
-    command was drawn there.
+    The command holds from the first step on. Only the frame that the reset makes before that step
+    contains another, random command.
 
     Args:
       policy: acts deterministically.
       setting: conditions.
-      velocities: [N, 3] commanded vx, vy [m/s] and, by heading, yaw rate [rad/s]. With a yaw rate
-        of 0 the robot is asked to keep its heading, as in training. With a schedule only N counts.
-      seed: of initial states and randomisation.
-      chunk: seconds per piece.
+      velocities: [N, 3] commanded vx, vy [m/s], yaw rate [rad/s]. A yaw rate of 0 commands a
+        constant heading, as in training. With a schedule only N counts.
+      seed: seed of initial states and randomisation.
+      chunk: duration of a piece [s].
     """
     count = len(velocities)
-    compiled = dataclasses.replace(setting, seconds=0.0, heading=0.0)  # for any of these two
+    # One compiled program serves all values of these two fields.
+    compiled = dataclasses.replace(setting, seconds=0.0, heading=0.0)
     start, advance = _programs(policy.config, compiled, count, env.step)
     legs = jnp.asarray(velocities, jnp.float32), jnp.float32(setting.heading)
     key_reset, key_run = jax.random.split(jax.random.key(seed))
     carry = start(policy.curriculum, *legs, jax.random.split(key_reset, count))
-    # On a named device, like the loaded parameters: else the second piece compiles once more.
+    # On a named device, like the loaded parameters. Else the second piece compiles again.
     carry = jax.device_put(carry, jax.devices()[0])
     steps = round(chunk / setting.physics.control_dt)
     for i in range(round(setting.seconds / chunk)):
@@ -189,7 +193,7 @@ def run(
 
 @functools.lru_cache(maxsize=4)
 def _programs(trained: Config, setting: Setting, count: int, step: Callable):
-    """(start, advance) of `count` environments, jitted once for all policies of a config."""
+    """(start, advance) for `count` environments, jitted once for all policies of a config."""
     config = trial_config(trained, setting, count)
 
     def start(curriculum: Curriculum, wanted: jax.Array, heading: jax.Array, keys) -> Trial:
@@ -211,8 +215,10 @@ def _programs(trained: Config, setting: Setting, count: int, step: Callable):
 def _start(
     config: Config, setting: Setting, curriculum: Curriculum, wanted: jax.Array, heading, key
 ) -> Trial:
-    """One robot at rest that heads to `heading` [rad], under the command `wanted` [3] if there is
-    no schedule."""
+    """Starts one robot at rest, with the heading `heading` [rad].
+
+    Without a schedule its command is `wanted` [3].
+    """
     state, robot = env.reset(config, key, curriculum), physics.robot_for(config.physics)
     own, key_body = jax.random.split(jax.random.fold_in(key, 1))
     leg = schedules.constant(wanted, heading)
@@ -231,7 +237,7 @@ def _start(
 
 
 def _face(robot: Robot, state: env.EnvState, heading: jax.Array) -> env.EnvState:
-    """The robot that heads to yaw 0, turned to `heading` [rad], and so shown in its first frame."""
+    """Turns a robot with yaw 0 to `heading` [rad], in its state and in its first frame."""
     zero = jnp.zeros(())
     quat = jnp.stack([jnp.cos(heading / 2), zero, zero, jnp.sin(heading / 2)])
     at = observations.slices(observations.actor_table(robot))["base_euler"].stop - 1
@@ -273,7 +279,7 @@ def _advance(
 
 
 def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key: jax.Array):
-    """The engine under the setting's disturbances, with the signature of `physics.step`."""
+    """The engine with the setting's disturbances. It has the signature of `physics.step`."""
     engine, more = setting.simulate or physics.step, {}
     if setting.punch:
         more["force"] = disturbances.punch(
@@ -293,7 +299,7 @@ def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key
 
 
 def _frame_error(setting: Setting, robot: Robot) -> np.ndarray:
-    """What the setting's sensor errors add to every actor frame [W]."""
+    """Sum [W] of the setting's sensor errors, to be added to every actor frame."""
     table = observations.actor_table(robot)
     error = np.zeros(observations.width(table), np.float32)
     at = observations.slices(table)["base_euler"].start
@@ -322,5 +328,5 @@ def _record(robot: Robot, trial: Trial, command: jax.Array, mass: jax.Array) -> 
 
 
 def join(pieces: list[Trace]) -> Trace:
-    """One trace from consecutive pieces."""
+    """Joins consecutive pieces to one trace."""
     return jax.tree.map(lambda *x: np.concatenate(x), *pieces)

@@ -1,7 +1,7 @@
-"""Robots that differ from the described one in what training does not draw: heavier hands, soles
-whose contact wanders, friction and damping of each joint.
+"""Differences of one robot from its description that training does not randomise.
 
-They change fields of the mjModel, see `physics.step`. One robot each.
+These are heavier hands, soles whose contact area changes, and friction and damping of each joint.
+All of them change fields of the mjModel, see `physics.step`.
 """
 
 import functools
@@ -17,24 +17,25 @@ from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
 
 FEET = ("left_foot", "right_foot")
-"""Boxes with which the feet meet the floor at high fidelity."""
+"""Box geoms of the feet at high fidelity."""
 
 TILT = 0.003
-"""Largest tilt of a wandering sole about each horizontal axis [rad]: 2 to 4 of its corners bear."""
+"""Largest tilt of a varied sole about each horizontal axis [rad]. Two to four of its corners then
+carry the load."""
 
 Fields = dict[str, jax.Array]
 
 
 @flax.struct.dataclass
 class Body:
-    """How one robot differs."""
+    """Differences of one robot's joints from the description."""
 
-    friction: jax.Array  # [n] N m
-    damping: jax.Array  # [n] N m s/rad
+    friction: jax.Array  # [n] N m, added Coulomb friction
+    damping: jax.Array  # [n] N m s/rad, added damping
 
 
 def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:
-    """Draws one robot."""
+    """Draws the differences of one robot."""
     key_friction, key_damping = jax.random.split(key)
     return Body(
         friction=variation.joints * jax.random.uniform(key_friction, (robot.count,)),
@@ -43,14 +44,17 @@ def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:
 
 
 def alter(variation: Variation, robot: Robot, body: Body, key: jax.Array, fields: Fields) -> Fields:
-    """The mjModel `fields` of `randomize.model_fields` for this robot.
+    """Applies the variation to the mjModel fields of `randomize.model_fields`.
 
     Args:
-      variation: static; only what it asks for is changed.
-      robot: at high fidelity, if soles wander.
-      body: how the robot differs.
-      key: of this control step.
+      variation: sizes of the differences (static under jit); 0 changes nothing.
+      robot: the described robot; `sole` needs it at high fidelity.
+      body: the differences of its joints.
+      key: random key of this control step.
       fields: mjModel fields by name.
+
+    Raises:
+      ConfigError: `sole` is set, and the robot's feet are not boxes of the names in `FEET`.
     """
     model = robot.mj_model
     if variation.hands:
@@ -80,7 +84,7 @@ def _heavier_hands(kg: float, robot: Robot, fields: Fields) -> Fields:
 
 @functools.lru_cache(maxsize=32)
 def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
-    """Centre, inertia and principal axes of all bodies, with point masses at the hands."""
+    """Centre, inertia and principal axes of all bodies, with a point mass of `kg` at each hand."""
     model = robot.mj_model
     names = ("body_ipos", "body_inertia", "body_iquat")
     out = {name: getattr(model, name).copy() for name in names}
@@ -90,7 +94,7 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
         axes = np.empty(9)
         mujoco.mju_quat2Mat(axes, model.body_iquat[i])
         axes = axes.reshape(3, 3)
-        # Parallel axes: two masses about their common centre have the reduced mass times d^2.
+        # Parallel axes: about their common centre two masses have the inertia (reduced mass) d^2.
         reduced = mass * kg / (mass + kg)
         spread = reduced * (arm @ arm * np.eye(3) - np.outer(arm, arm))
         inertia, axes = np.linalg.eigh(axes @ np.diag(out["body_inertia"][i]) @ axes.T + spread)
@@ -102,7 +106,7 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
 
 
 def _soles(inset: float, robot: Robot, key: jax.Array) -> Fields:
-    """Foot boxes inside the described ones, tilted by up to `TILT`."""
+    """Random foot boxes that lie inside the described ones and are tilted by up to `TILT`."""
     model = robot.mj_model
     feet = np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) for foot in FEET])
     if feet.min() < 0:

@@ -1,4 +1,4 @@
-"""Checkpoints of a whole training; see `checkpoint_format` for what one holds."""
+"""Checkpoints of a whole training. `checkpoint_format` describes their content."""
 
 import contextlib
 import itertools
@@ -26,7 +26,7 @@ from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
 BEST_METRIC = "score"
-"""The metric by which the best checkpoint is chosen."""
+"""The metric that selects the best checkpoint."""
 
 
 def _split(state: TrainState) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _join(parts: dict[str, Any], like: TrainState) -> TrainState:
 
 
 class Store:
-    """The checkpoints of one run folder: the latest `keep` and the best by `score`."""
+    """The checkpoints of one run folder. It keeps the latest `keep`, and the best by `score`."""
 
     def __init__(self, run_dir: Path, keep: int = 3):
         policies = ocp.checkpoint_managers
@@ -77,7 +77,7 @@ class Store:
         return sorted(self._manager.all_steps())
 
     def save(self, state: TrainState, config: Config, metrics: dict[str, float]) -> None:
-        """Starts writing `state` in the background; CheckpointError if it cannot."""
+        """Starts to write `state` in the background; CheckpointError if that fails."""
         step = int(state.step)
         if step in self.steps():
             return
@@ -101,8 +101,11 @@ class Store:
 
     @contextlib.contextmanager
     def _writing(self) -> Generator[None]:
-        """After a failure: one CheckpointError, and a manager that has cleared the half-written
-        checkpoint away. The old one would raise again at each later call."""
+        """Turns any failure into a CheckpointError.
+
+        After a failure it removes the incomplete checkpoint and makes a new manager: the old one
+        would raise again at each later call.
+        """
         try:
             yield
         except Exception as error:
@@ -117,10 +120,16 @@ class Store:
             ) from error
 
     def restore(self, like: TrainState, warn: Callable[[str], None]) -> TrainState:
-        """The latest whole checkpoint, as the type of `like` (arrays or their abstract shapes).
+        """Reads the latest checkpoint that is not damaged.
 
-        A damaged one is reported through `warn`, put aside, and the one before it is taken. A robot
-        that has changed since then is reported too.
+        A damaged checkpoint is renamed, and the one before it is read instead.
+
+        Args:
+          like: gives the shapes and types: arrays, or their abstract shapes.
+          warn: called for each damaged checkpoint, and if the robot has changed since the save.
+
+        Raises:
+          CheckpointError: there is no readable checkpoint.
         """
         steps, bad = self.steps(), {}
         for step in reversed(steps):
@@ -142,7 +151,7 @@ class Store:
         raise CheckpointError(f"no readable checkpoint in {self.folder}; the latest: {why}")
 
     def _put_aside(self, bad: dict[int, str], used: int, warn: Callable[[str], None]) -> None:
-        """Renames the damaged checkpoints, whose steps will come again."""
+        """Renames the damaged checkpoints: the training will save the same steps again."""
         for step, why in bad.items():
             names = (f"damaged-{step}" + "-again" * i for i in itertools.count())
             aside = next(p for p in map(self.folder.joinpath, names) if not p.exists())
@@ -152,7 +161,7 @@ class Store:
             self._manager.reload()
 
     def _restore(self, step: int, like: TrainState) -> tuple[TrainState, str]:
-        """The state, and the numbers in which the robot has changed since it was saved."""
+        """(state, description of the robot's changes since the save; empty if there are none)."""
         parts = _split(like)
         items = {name: ocp.args.StandardRestore(abstract(part)) for name, part in parts.items()}
         only_meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
@@ -165,7 +174,7 @@ class Store:
         return _join({name: restored[name] for name in items}, like), changed
 
     def close(self) -> None:
-        """Waits for writes and lets go of the folder."""
+        """Waits for the last save and closes the folder."""
         self.wait()
         self._manager.close()
 

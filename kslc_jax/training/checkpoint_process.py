@@ -1,8 +1,8 @@
 """Checkpoint I/O. With several processes, a child of process 0 does it.
 
-Orbax is part of JAX's cluster: each save and each restore waits for all processes in it, and where
-one fails alone the others wait for ever. So of several processes the first lets a child do it that
-belongs to no cluster. What passes between the two is numbers on the host.
+In a JAX cluster each save and each restore of orbax waits for all processes. If one process fails,
+the others wait for ever. So process 0 starts a child process that belongs to no cluster. The two
+exchange numpy arrays.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from kslc_jax.training.checkpoint import Store
 
 
 class CheckpointStore(Protocol):
-    """What a `Store` does for a training."""
+    """The part of `Store` that a training needs."""
 
     def steps(self) -> list[int]: ...
     def save(self, state: TrainState, config: Config, metrics: dict[str, float]) -> None: ...
@@ -39,26 +39,26 @@ class CheckpointStore(Protocol):
 
 
 class LocalStorage:
-    """This process does it."""
+    """Reads and writes checkpoints and policies in this process."""
 
     def open(self, run_dir: Path, config: Config) -> CheckpointStore:
-        """The checkpoints of a run folder."""
+        """Opens the checkpoints of a run folder."""
         return Store(run_dir, config.run.keep)
 
     def save_policy(self, policy: Policy, folder: Path) -> None:
-        """As `policy_lib.save_policy`."""
+        """Does the same as `policy_lib.save_policy`."""
         policy_lib.save_policy(policy, folder)
 
     def load_policy(self, path: Path) -> Policy:
-        """As `policy_lib.load_policy`."""
+        """Does the same as `policy_lib.load_policy`."""
         return policy_lib.load_policy(path)
 
     def close(self) -> None:
-        """Lets go."""
+        """Does nothing: there is no child process to end."""
 
 
 class ChildProcessStorage(LocalStorage):
-    """A child does it; what it meets is raised here."""
+    """Reads and writes in a child process. A failure there raises a CheckpointError here."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
@@ -72,7 +72,7 @@ class ChildProcessStorage(LocalStorage):
         return self
 
     def steps(self) -> list[int]:
-        """As `Store.steps`, like those below."""
+        """Does the same as `Store.steps`. The methods below match those of `Store`, too."""
         return self._ask("steps")
 
     def save(self, state: TrainState, config: Config, metrics: dict[str, float]) -> None:
@@ -115,7 +115,7 @@ def _on_host(policy: Policy) -> Policy:
 
 
 class _Server:
-    """What the child does, by the name of what it is asked for."""
+    """The requests that the child answers. A method has the name of its request."""
 
     save_policy = staticmethod(policy_lib.save_policy)
 
@@ -142,11 +142,11 @@ class _Server:
 
 
 def _serve(pipe: Connection) -> None:
-    """The child: answers until the other end is closed, be it by the other's death."""
+    """The child's main function. It answers requests until the parent closes the pipe or dies."""
     runtime.prepare(gl=False)
     runtime.quiet()
-    jax.config.update("jax_platforms", "cpu")  # the accelerator is the training's
-    for number in stopping.SIGNALS:  # terminals and schedulers signal this process, too
+    jax.config.update("jax_platforms", "cpu")  # the training uses the accelerator
+    for number in stopping.SIGNALS:  # terminals and schedulers signal the child, too
         signal.signal(number, signal.SIG_IGN)
     server = _Server()
     with contextlib.suppress(EOFError, OSError):

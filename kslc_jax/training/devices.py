@@ -1,13 +1,14 @@
-"""A training over several devices, of one process or of many: who holds what, who tells whom.
+"""A training over several devices, of one process or of several.
 
-Environments [N, ...] are split over a mesh of one axis; networks, optimiser, curriculum and
-counters are on every device. The train step is the same program: `jit` with these shardings puts in
-what the devices have to tell each other, and its numbers are those of one device up to the order of
-sums. docs/scaling.md counts what is told.
+Environments [N, ...] are split over a mesh with one axis. Networks, optimiser, curriculum and
+counters are replicated on every device. The train step is the same program: `jit` with these
+shardings adds the communication. Its numbers equal those of one device, except for the order of
+sums. docs/scaling.md counts the communication.
 
-Several processes run the same program side by side. What only one of them can know goes through
-`agree`, `on_first` and `from_first`, which all of them call at the same point: so they take the
-same turns, and none waits for one that has gone.
+Several processes run the same program side by side. Some facts are known to one process only, for
+example a signal. Processes exchange them through `agree`, `on_first` and `from_first`. All
+processes call these at the same point of the program. So they take the same branches, and no
+process waits for one that has ended.
 """
 
 import contextlib
@@ -34,7 +35,7 @@ from kslc_jax.train_step import Metrics, TrainState
 AXIS = "env"
 
 WAIT = 3600
-"""Seconds that processes wait for each other outside of train steps, say for one that compiles."""
+"""Time [s] for which processes wait for each other outside of train steps, as for a compilation."""
 
 T = TypeVar("T")
 
@@ -42,18 +43,19 @@ T = TypeVar("T")
 def join(
     coordinator: str | None = None, processes: int | None = None, index: int | None = None
 ) -> None:
-    """Makes this process one of many, before JAX does anything else. Under Slurm, Open MPI,
-    Kubernetes and on TPU pods JAX finds out by itself: no argument is needed.
+    """Makes this process one of several. Call it before JAX does anything else.
+
+    Under Slurm, Open MPI, Kubernetes and on TPU pods JAX finds the arguments by itself.
 
     Args:
-      coordinator: host:port that process 0 listens on and all others can reach.
-      processes: how many there are.
-      index: which one this is, from 0.
+      coordinator: host:port at which process 0 listens. All others must be able to reach it.
+      processes: number of processes.
+      index: index of this process, from 0.
 
     Raises:
-      ConfigError: it is not to be.
+      ConfigError: the processes cannot be joined.
     """
-    with contextlib.suppress(AttributeError):  # older ones have no such switch
+    with contextlib.suppress(AttributeError):  # older JAX versions lack this option
         jax.config.update("jax_enable_preemption_service", False)  # the loop handles SIGTERM
     try:
         jax.distributed.initialize(coordinator, processes, index)
@@ -63,13 +65,21 @@ def join(
 
 
 def splits(config: Config, count: int) -> bool:
-    """Whether environments and minibatches come out even over so many devices."""
+    """True if `count` devices can share environments and minibatches evenly."""
     return config.env.num_envs % count == 0 and config.minibatch_size % count == 0
 
 
 def choose(config: Config, wanted: int | None = None) -> list[jax.Device]:
-    """The devices to train on: `wanted` of each process. Without, as many accelerators of each as
-    the batch splits evenly over, and one where the physics or the device is a CPU."""
+    """The devices to train on, the same number from each process.
+
+    Args:
+      config: the training's config.
+      wanted: devices per process. None: as many accelerators as can share the batch evenly, but
+        one if the device is a CPU or the physics runs on the CPU.
+
+    Raises:
+      ConfigError: a process has fewer devices than `wanted`, or `wanted` is below 1.
+    """
     there = jax.devices()
     held = Counter(d.process_index for d in there)
     least = min(held.values())
@@ -89,13 +99,17 @@ def choose(config: Config, wanted: int | None = None) -> list[jax.Device]:
 
 
 def pick(config: Config, wanted: int | None = None) -> Mesh | None:
-    """The mesh of `choose`'s devices; None for one device of one process, which needs none."""
+    """The mesh of the devices from `choose`; None for one device of one process."""
     chosen = choose(config, wanted)
     return mesh(config, chosen) if several() or len(chosen) > 1 else None
 
 
 def mesh(config: Config, devices: Sequence[jax.Device] | None = None) -> Mesh:
-    """All devices of all processes, or those given, in a row; ConfigError if they cannot share."""
+    """A mesh with one axis of the given devices, by default all devices of all processes.
+
+    Raises:
+      ConfigError: the devices cannot share the batch evenly, or the engine runs on one device only.
+    """
     devices = jax.devices() if devices is None else devices
     count = len(devices)
     if not splits(config, count):
@@ -109,7 +123,7 @@ def mesh(config: Config, devices: Sequence[jax.Device] | None = None) -> Mesh:
 
 
 def shardings(mesh: Mesh, like: TrainState) -> TrainState:
-    """Where each array of a training lives, as a tree of `like`'s structure."""
+    """The sharding of each array of a train state, as a tree with the structure of `like`."""
     everywhere = NamedSharding(mesh, PartitionSpec())
     split = NamedSharding(mesh, PartitionSpec(AXIS))
     placed = jax.tree.map(lambda _: everywhere, like)
@@ -117,8 +131,11 @@ def shardings(mesh: Mesh, like: TrainState) -> TrainState:
 
 
 def place(mesh: Mesh, state: TrainState) -> TrainState:
-    """`state`, which any device may hold, as `make`'s train step takes it. Each process gives the
-    same numbers and keeps what is for its devices."""
+    """Distributes `state` over the mesh, as the train step of `make` needs it.
+
+    The state may lie on any device. Every process passes the same numbers, and keeps the part for
+    its own devices.
+    """
 
     def put(x: jax.Array, sharding: NamedSharding) -> jax.Array:
         if isinstance(x, jax.Array) and not x.is_fully_addressable:
@@ -133,7 +150,7 @@ def place(mesh: Mesh, state: TrainState) -> TrainState:
 def make(
     config: Config, mesh: Mesh
 ) -> tuple[Callable[[], TrainState], Callable[[TrainState], tuple[TrainState, Metrics]]]:
-    """`train_step.make` over a mesh: (init, train_step), both jitted; train_step donates."""
+    """(init, train_step) for a mesh, as from `train_step.make`. The step donates its state."""
 
     def shard_index(index: jax.Array) -> jax.Array:
         split = NamedSharding(mesh, PartitionSpec(AXIS))
@@ -155,16 +172,16 @@ def make(
 
 
 class Elsewhere(UserError, RuntimeError):
-    """Another process gave up, and says why."""
+    """Another process failed. That process prints the reason."""
 
 
 def several() -> bool:
-    """Whether this process is one of many."""
+    """True if this process is one of several."""
     return jax.process_count() > 1
 
 
 def is_first() -> bool:
-    """Whether it is the one that reads, writes and speaks."""
+    """True in process 0, the only process that reads, writes and prints."""
     return jax.process_index() == 0
 
 
@@ -172,7 +189,10 @@ _meetings = itertools.count()
 
 
 def meet() -> None:
-    """Waits until all processes are here. XLA's own collectives wait for less than a minute."""
+    """Waits until all processes have called it, at most `WAIT`.
+
+    XLA's own collectives wait for less than a minute.
+    """
     if several():
         everyone = set(range(jax.process_count()))
         name = f"kslc_jax {next(_meetings)}"
@@ -180,7 +200,7 @@ def meet() -> None:
 
 
 def agree(*flags: bool) -> list[bool]:
-    """Each flag, set where any process has it set."""
+    """Each flag is True if it is True in any process."""
     if not several():
         return list(flags)
     meet()
@@ -188,8 +208,11 @@ def agree(*flags: bool) -> list[bool]:
 
 
 def on_first(do: Callable[[], T]) -> T | None:
-    """What `do()` gives in the first process, once it is done; None in the others. Where it fails,
-    they raise Elsewhere."""
+    """Calls `do` in the first process; the others wait.
+
+    Returns the result of `do` in the first process, None in the others. If `do` raises, the first
+    process raises the same error, and the others raise Elsewhere.
+    """
     result, failure = None, None
     if is_first():
         try:
@@ -205,14 +228,17 @@ def on_first(do: Callable[[], T]) -> T | None:
 
 
 def from_first(make: Callable[[], T], like: T) -> T:
-    """The tree of arrays that `make()` gives in the first process, in each; on the host where there
-    are several. `like` has its structure, shapes and types."""
+    """Calls `make` in the first process and sends the result, a tree of arrays, to all processes.
+
+    `like` gives the structure, shapes and types of the result. With several processes the result
+    consists of arrays on the host.
+    """
     made = on_first(make)
     if not several():
         return cast(T, made)
     blank = jax.tree.map(_blank, like)
     tree = blank if made is None else jax.tree.map(host_array, made)
-    # As bytes: numbers are summed over the processes, which would make +0 of -0.
+    # Sent as bytes: the broadcast is a sum over the processes, which would turn -0 into +0.
     sent = np.frombuffer(b"".join(x.tobytes() for x in jax.tree.leaves(tree)), np.uint8)
     got = np.asarray(multihost_utils.broadcast_one_to_all(sent))
     ends = np.cumsum([x.nbytes for x in jax.tree.leaves(blank)])
@@ -226,13 +252,13 @@ def from_first(make: Callable[[], T], like: T) -> T:
 
 
 def _blank(like: Any) -> np.ndarray:
-    """Zeros of an array's shape and type, of a typed key's data."""
+    """Zeros with the shape and type of an array; for a typed key, of its key data."""
     like = jax.eval_shape(jax.random.key_data, like) if is_key(like) else like
     return np.zeros(like.shape, like.dtype)
 
 
 def whole(state: TrainState) -> TrainState:
-    """`state` as one process can read it: where there are several, gathered on a device of each."""
+    """A state that one process can read. With several processes each one gathers a full copy."""
     if not several():
         return state
     sharding = jax.tree.leaves(state)[0].sharding
@@ -242,8 +268,11 @@ def whole(state: TrainState) -> TrainState:
 
 
 def leave(code: int) -> int:
-    """The exit code of a process that has failed alone. One of several ends here and now: the usual
-    end would wait for the others, who wait for it. That it is gone ends them too."""
+    """Returns the exit code of a process that failed alone. One of several exits at once.
+
+    A normal exit would wait for the other processes, which wait for this one. When this process is
+    gone, the others end, too.
+    """
     if several():
         sys.stdout.flush()
         sys.stderr.flush()

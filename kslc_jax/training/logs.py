@@ -1,4 +1,4 @@
-"""The records of a training: JSONL and TensorBoard files, and progress on the terminal."""
+"""Records of the metrics: JSONL and TensorBoard files, and the progress on the terminal."""
 
 import contextlib
 import json
@@ -20,20 +20,20 @@ from kslc_jax import files
 from kslc_jax.config import Config
 
 PLAIN_SECONDS = 10.0
-"""Seconds between progress lines where the output is no terminal."""
+"""Time [s] between two progress lines if the output is no terminal."""
 
 
 def rows_written(run_dir: Path) -> int:
-    """Records in a run folder's metrics.jsonl."""
+    """Number of records in a run folder's metrics.jsonl."""
     path = run_dir / files.METRICS
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
 class MetricsFile:
-    """metrics.jsonl (one record a line) and TensorBoard events of one run folder.
+    """Writes metrics.jsonl (one record per line) and TensorBoard events of one run folder.
 
-    Records after train step `after` are dropped: the resumed run writes them again. A full disk is
-    told by `warn`, once; records wait until there is room.
+    It removes the records after train step `after`, because the resumed run writes them again. If
+    the disk is full, it calls `warn` once and keeps the records in memory until there is room.
     """
 
     def __init__(self, run_dir: Path, after: int = 0, warn: Callable[[str], None] = print):
@@ -65,12 +65,12 @@ class MetricsFile:
             self._full = True
 
     def _flush(self) -> None:
-        """Writes as much as fits; a line that a full disk cuts off is completed later."""
+        """Writes as much as fits. If a full disk cuts a line off, a later call completes it."""
         while self._waiting:
             self._waiting = self._waiting[self._file.write(self._waiting) :]
 
     def close(self) -> None:
-        """Writes what is left to both."""
+        """Writes the records that still wait, and closes the files."""
         with contextlib.suppress(OSError):  # already reported
             self._flush()
         with contextlib.suppress(OSError):
@@ -79,17 +79,17 @@ class MetricsFile:
 
 
 class _Board:
-    """TensorBoard events, written in this thread.
+    """Writes TensorBoard events in the thread of the caller.
 
-    tensorboardX's SummaryWriter has a thread that dies when the disk is full; the training would
-    then wait for it for ever."""
+    The SummaryWriter of tensorboardX has its own thread. That thread dies if the disk is full, and
+    the training would then wait for it for ever.
+    """
 
     def __init__(self, folder: Path, after: int):
         folder.mkdir(exist_ok=True)
         self._events = EventsWriter(str(folder / "events"), f".{os.getpid()}.{after}")
-        session = event_pb2.SessionLog(
-            status=event_pb2.SessionLog.START
-        )  # hides what was shown beyond `after`
+        # This event makes TensorBoard hide older records beyond `after`.
+        session = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
         self._events.write_event(event_pb2.Event(step=after + 1, session_log=session))
 
     def write(self, record: dict[str, float]) -> None:
@@ -104,7 +104,7 @@ class _Board:
         self._events.flush()
 
     def close(self) -> None:
-        """Writes what is left."""
+        """Writes the last events and closes the file."""
         self._events.close()
 
 
@@ -114,7 +114,7 @@ def finite_values(record: dict[str, float]) -> dict[str, float]:
 
 
 def _step(line: str) -> int:
-    """Train step of a record; that of a line that is cut off is larger than any other."""
+    """Train step of a record. A line that is cut off gets a number larger than any other."""
     try:
         return int(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):
@@ -128,7 +128,7 @@ def duration(seconds: float) -> str:
 
 
 class Progress:
-    """Shows a live table on a terminal, and a line every few seconds elsewhere."""
+    """Shows a live table on a terminal; otherwise prints a line every few seconds."""
 
     def __init__(self, config: Config, console: Console | None = None):
         self.config = config

@@ -1,8 +1,9 @@
-"""The host's loop around the jitted train step: stepping, going back, stopping.
+"""The host's loop around the jitted train step.
 
-`train_step` decides all numbers. This file calls it, reads its metrics, saves, and stops. With
-several processes each one runs this loop. What only one of them knows (a signal, the time, the
-contents of the disk) it tells the others through `devices`.
+`train_step` computes all numbers. This loop calls it, reads its metrics, saves, goes back to a
+checkpoint after bad numbers, and stops. With several processes each one runs this loop. Some facts
+are known to one process only (a signal, the time, the contents of the disk); `devices` sends them
+to the others.
 """
 
 import contextlib
@@ -66,22 +67,23 @@ def train(
     profile: int = 0,
     wandb: bool = False,
 ) -> TrainState:
-    """Trains until `config.run.steps` or a signal. Saves the state then, and every few minutes.
+    """Trains until `config.run.steps` or a signal. Saves every few minutes and at the end.
 
     Args:
       config: the training's config.
-      run_dir: the run folder; with several processes only that of the first one counts.
-      resume: go on from the run folder's latest checkpoint.
-      progress: shows the metrics and says what happens.
-      start_from: a policy whose networks and curriculum a new training begins with.
+      run_dir: the run folder; with several processes only that of the first one is used.
+      resume: True: continue from the run folder's latest checkpoint.
+      progress: shows metrics and messages.
+      start_from: a policy; the new training begins with its networks and curriculum.
       mesh: the devices of all processes, see `devices.mesh`; None for one device.
-      profile: train steps to trace, see `profiling`.
-      wandb: send the records to Weights & Biases as well, see `wandb_run`.
+      profile: number of train steps to trace, see `profiling`.
+      wandb: True: also send the records to Weights & Biases, see `wandb_run`.
 
     Raises:
-      RunError, ConfigError, CheckpointError: it cannot start, or its last state cannot be saved.
-      MissingPackage, UserError: `wandb` is asked for and not there, or refuses.
-      NumbersError: numbers went bad again and again, or nothing was learnt at all.
+      RunError, ConfigError, CheckpointError: the training cannot start, or its last state cannot be
+        saved.
+      MissingPackage, UserError: the package wandb is missing, or it refuses.
+      NumbersError: numbers went bad in all attempts, or no train step learnt anything.
       Elsewhere: the first process raised one of these, and this is another process.
     """
     init, step = train_step.make(config) if mesh is None else devices.make(config, mesh)
@@ -179,7 +181,7 @@ def _starting_from(
 
 
 def _train(job: _Job) -> TrainState:
-    """Compiles and trains; goes back to a checkpoint if numbers are not finite."""
+    """Compiles and trains. Goes back to a checkpoint after bad numbers, see `recovery`."""
     start = time.monotonic()
     if job.resume:
         state = job.restored()
@@ -254,7 +256,7 @@ def _last_good(job: _Job) -> TrainState:
 
 
 def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
-    """Trains step by step; returns the last state, which is saved."""
+    """Trains step by step; saves and returns the last state."""
     first = int(state.step)
     record: Record = {}
     numerics, watchdog = NumericsCheck(state), Watchdog()
@@ -309,7 +311,7 @@ def _nothing_to_do(job: _Job, step: int) -> str:
 
 
 def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
-    """One paragraph about the training that is about to run."""
+    """Describes the coming training: its size, engine, devices, memory and folder."""
     n, t = config.env.num_envs, config.ppo.rollout_steps
     engine, kind = physics.resolve_engine(config.physics), jax.devices()[0].device_kind
     count = 1 if mesh is None else mesh.size

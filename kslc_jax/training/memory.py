@@ -1,10 +1,10 @@
-"""The memory that a training takes on each device: estimated before it compiles, measured after.
+"""Memory of a training on each device: an estimate before it compiles, XLA's plan afterwards.
 
-A train step has two phases, of which the larger one counts. The rollout fills the trajectory and
-needs what one control step needs. The update keeps frames and samples, and adds a minibatch: its
-windows of frames, and what its networks keep for the gradient. Sizes of arrays come from the shapes
-of the program itself; the constants below are read off XLA's buffer assignments;
-docs/performance.md compares.
+A train step has two phases; the larger one counts. The rollout needs the trajectory and the arrays
+of one control step. The update needs the frames, the samples and one minibatch: its windows of
+frames, and the activations that its networks keep for the gradient. The sizes of arrays come from
+the shapes of the program. The constants below come from XLA's buffer assignments.
+docs/performance.md compares the estimate with measurements.
 """
 
 import functools
@@ -20,22 +20,22 @@ from kslc_jax.rollout import Trajectory
 from kslc_jax.train_step import TrainState
 
 NUMBER = 4
-"""Bytes of a number."""
+"""Bytes of one number."""
 
 KEPT_PER_UNIT = 3
-"""Numbers that each hidden unit keeps for a sample's gradient: its input, its output, the slope."""
+"""Numbers that the gradient of a sample needs per hidden unit: its input, its output, the slope."""
 
 STATES_PER_STEP = 3
-"""Environment states that a control step has at a time: the old, the new, the chosen."""
+"""Environment states that a control step holds at once: the old, the new and the selected one."""
 
 MJX_STEP = 25 * 2**10
-"""Bytes of one environment in MJX's physics step: its model, data, contacts and solver."""
+"""Bytes of one environment in MJX's physics step: model, data, contacts and solver."""
 
 COPIES_OF_NETWORKS = 3
-"""The gradient, its scaled update, and the new parameters, beside those of the state."""
+"""Copies of the parameters besides those of the state: gradient, scaled update, new parameters."""
 
 PROCESS = 2**30
-"""Bytes of a process that trains on the CPU, before its first train step: Python, JAX, compiler."""
+"""Bytes that Python, JAX and the compiler take in a training on the CPU, before its first step."""
 
 
 def estimate(config: Config, devices: int = 1) -> int:
@@ -50,8 +50,10 @@ def estimate(config: Config, devices: int = 1) -> int:
 
 @functools.lru_cache(maxsize=8)
 def shapes(config: Config) -> tuple[TrainState, Trajectory, Samples]:
-    """Shapes of the state, of a rollout and of its samples. The physics, which takes long to trace
-    and changes no shape, is left out."""
+    """Shapes of the state, of a rollout and of its samples.
+
+    The traced program leaves the physics out: it takes long to trace, and changes no shape.
+    """
 
     def one() -> tuple[TrainState, Trajectory, Samples]:
         state = train_step.init(config, 0)
@@ -72,12 +74,12 @@ def _rollout(config: Config, trajectory: Trajectory, environments: float, device
 def _update(
     config: Config, state: TrainState, trajectory: Trajectory, samples: Samples, devices: int
 ) -> float:
-    """Bytes of frames and samples, all of them on each device, and of a device's minibatch."""
+    """Bytes of all frames and samples, which each device holds, and of a device's minibatch."""
     histories = state.env.history, state.env.privileged_history
     before = sum(_bytes(history) * (1 - 1 / history.shape[1]) for history in histories)
     frames = _bytes((trajectory.frame, trajectory.privileged)) + before
     window = _bytes(histories) / config.env.num_envs
-    inputs = window * (2 if config.network.symmetric else 1)  # and split into even and odd parts
+    inputs = window * (2 if config.network.symmetric else 1)  # a copy in even and odd parts
     kept = NUMBER * KEPT_PER_UNIT * (sum(config.network.actor) + sum(config.network.critic))
     return frames + _bytes(samples) + config.minibatch_size / devices * (inputs + kept)
 
@@ -87,7 +89,7 @@ def _bytes(tree: Any) -> int:
 
 
 def measured(compiled: Any) -> int | None:
-    """Bytes on each device that XLA has planned for a compiled train step; None where unknown."""
+    """Bytes that XLA plans for a compiled train step on each device; None if unknown."""
     analysis = getattr(compiled, "memory_analysis", lambda: None)()
     if analysis is None:
         return None
@@ -96,13 +98,13 @@ def measured(compiled: Any) -> int | None:
 
 
 def shown(size: float) -> str:
-    """A number of bytes for people."""
+    """A number of bytes as text, in MiB or GiB."""
     number, unit = (size / 2**30, "GiB") if size >= 2**30 else (size / 2**20, "MiB")
     return f"{number:.{1 if number < 10 else 0}f} {unit}"
 
 
 def check(config: Config, devices: int = 1) -> None:
-    """ConfigError where a training cannot fit into its devices' memory."""
+    """ConfigError if a training does not fit into the memory of its devices."""
     device = jax.local_devices()[0]
     memory = (device.memory_stats() or {}).get("bytes_limit")
     state, *_ = shapes(config)

@@ -1,4 +1,4 @@
-"""The profiler's trace of a few train steps: where the time goes, operation by operation."""
+"""The profiler's trace of a few train steps: the time that each operation takes."""
 
 import contextlib
 from collections.abc import Callable, Generator
@@ -7,11 +7,11 @@ from pathlib import Path
 import jax
 
 trace = jax.profiler.trace
-"""trace(folder): traces what runs within, on host and devices, into a new subfolder."""
+"""trace(folder): a context that traces host and devices, and writes into a new subfolder."""
 
 
 def how_to_open(folder: Path) -> str:
-    """What to do with what a trace has left in `folder`."""
+    """Says how to open the trace in `folder`."""
     return (
         "open its *.trace.json.gz at ui.perfetto.dev, or all of it with xprof "
         f"(pip install xprof; xprof --logdir '{folder}') or TensorBoard and its profile plugin"
@@ -19,9 +19,9 @@ def how_to_open(folder: Path) -> str:
 
 
 class Profile:
-    """Traces `steps` train steps of a loop, from its second on: the first one meets cold caches.
+    """Traces `steps` train steps of a loop. It skips the first step, which meets cold caches.
 
-    It changes no number, and no training dies of it: what cannot be written is told by `warn`.
+    It changes no number. A trace that cannot be written ends no training: it calls `warn`.
     """
 
     def __init__(
@@ -34,7 +34,7 @@ class Profile:
 
     @contextlib.contextmanager
     def step(self, number: int) -> Generator[None]:
-        """Around train step `number`."""
+        """Context of the train step `number`."""
         self._seen += 1
         if self._seen == 1 or not self._left:
             yield
@@ -48,7 +48,7 @@ class Profile:
             self._finish()
 
     def close(self) -> None:
-        """Writes what has been traced, where the loop ended early."""
+        """Writes the traced steps if the loop ended before all were traced."""
         if self._left:
             self._finish()
 

@@ -1,7 +1,7 @@
 """Keeps the results of a training: metrics, checkpoints, and snapshots of the policy.
 
-With several processes only the first one keeps anything. The others have a `NullRecorder`, so that
-all run the same loop.
+With several processes only the first one writes. The others have a `NullRecorder`, so that all
+processes run the same loop.
 """
 
 import contextlib
@@ -27,14 +27,14 @@ Record = dict[str, float]
 
 
 class NullRecorder:
-    """Keeps nothing."""
+    """Does nothing."""
 
     def at(self, step: int) -> contextlib.AbstractContextManager[None]:
         """Context of a loop that begins after train step `step`."""
         return contextlib.nullcontext()
 
     def log(self, metrics: Record, step: int, took: float) -> Record:
-        """Shows and writes the metrics of a train step that took `took` seconds."""
+        """Shows and writes the metrics of a train step that took `took` seconds; returns them."""
         return metrics
 
     def has_checkpoints(self) -> bool:
@@ -53,10 +53,10 @@ class NullRecorder:
         """Writes a checkpoint in the background."""
 
     def keep_snapshot(self, state: TrainState) -> None:
-        """Writes the policy alone."""
+        """Writes a snapshot: the policy alone."""
 
     def drop_snapshots(self, after: int) -> None:
-        """Removes snapshots of train steps after `after`: the training has gone back to it."""
+        """Removes the snapshots of later train steps than `after`; the training went back to it."""
 
     def settle(self) -> None:
         """Blocks until the last save is on disk or has failed; the training goes on either way."""
@@ -66,9 +66,9 @@ class NullRecorder:
 
 
 class Recorder(NullRecorder):
-    """Writes everything into one run folder, and shows it.
+    """Writes everything into one run folder, and shows the metrics.
 
-    A failed save must not end hours of training: it gives a warning, and the next one tries again.
+    A failed save must not end hours of training: it gives a warning, and the next save tries again.
     Only the last save raises a CheckpointError.
     """
 
@@ -128,7 +128,7 @@ class Recorder(NullRecorder):
         self._saved = time.monotonic()
 
     def keep_snapshot(self, state: TrainState) -> None:
-        """A snapshot from before a resume stays as it is."""
+        """Writes a snapshot, unless one of this train step is there from before a resume."""
         folder = self._run_dir / files.SNAPSHOTS / str(int(state.step))
         with self._going_on():
             if not folder.exists():

@@ -1,7 +1,7 @@
-"""Numbers gone bad: when a training goes back to a checkpoint, and what it leaves when it gives up.
+"""Recovery from bad numbers: a training goes back to a checkpoint, or gives up and writes a dump.
 
-`train_step` masks broken samples and gives their environments a new episode. This file handles what
-that cannot repair: parameters that are not finite, and updates that learn nothing.
+`train_step` masks broken samples and gives their environments a new episode. This file handles the
+rest: parameters that are not finite, and updates that learn nothing.
 """
 
 import json
@@ -22,30 +22,30 @@ from kslc_jax.runtime import first_line
 from kslc_jax.train_step import TrainState
 
 PATIENCE = 10
-"""Train steps in a row that learn nothing, after which a training goes back; also those with many
-broken samples, after which it warns."""
+"""A training goes back after this number of train steps in a row that learn nothing. It warns after
+the same number of train steps in a row with many broken samples."""
 
 ALL = 0.9999
-"""A share from here on means all: a float32 mean of ones may be below 1."""
+"""Shares from this value on count as all: a float32 mean of ones may be below 1."""
 
 MANY = 0.01
-"""Share of broken samples above which a training warns."""
+"""Share of broken samples. Larger shares count as many, see `PATIENCE`."""
 
 ATTEMPTS = 3
-"""A training goes back to the same checkpoint this often before it gives up."""
+"""A training goes back to the same checkpoint at most this many times, then it gives up."""
 
 CAUTION = 0.5
-"""Factor on the learning rate each time it goes back."""
+"""Factor on the learning rate each time a training goes back."""
 
 
 class NumbersError(UserError, RuntimeError):
-    """The numbers go bad however often the training goes back."""
+    """The numbers go bad in every attempt."""
 
     exit_code = 1
 
 
 class NonFiniteState(Exception):
-    """The training cannot go on from here; carries the state before the first bad train step."""
+    """A training cannot go on. `before` is the state before the first bad step."""
 
     def __init__(self, why: str, before: TrainState):
         super().__init__(why)
@@ -54,12 +54,12 @@ class NonFiniteState(Exception):
 
 @jax.jit
 def _copy(state: TrainState) -> TrainState:
-    """Copies all leaves in one program; a program for each leaf would keep a GPU waiting."""
+    """Copies all leaves in one program. One program per leaf would let a GPU wait."""
     return jax.tree.map(jnp.copy, state)
 
 
 class NumericsCheck:
-    """Tells from the metrics of each train step if a training's numbers are good.
+    """Decides from the metrics of each train step if the numbers are good.
 
     A bad train step leaves a learner or curriculum that is not finite, or learns nothing: none of
     its gradients is finite, or all of its samples are broken.
@@ -82,12 +82,15 @@ class NumericsCheck:
         return self._finite
 
     def before(self, state: TrainState) -> None:
-        """Keeps a copy, because the step donates `state`; during bad steps the one before them."""
+        """Keeps a copy of the state before a step, because the step donates `state`.
+
+        During bad steps it keeps the copy from before the first bad one.
+        """
         if self.good:
             self._before = _copy(state)
 
     def after(self, metrics: dict[str, float]) -> str:
-        """Takes in the metrics of a train step; returns a warning, or nothing."""
+        """Checks the metrics of a train step. Returns a warning; empty if there is none."""
         self._steps += 1
         self._finite = metrics["finite"] == 1.0
         self._why = _nothing_learnt(metrics)
@@ -102,29 +105,30 @@ class NumericsCheck:
         )
 
     def require_good(self) -> None:
-        """NonFiniteState if more of the same would not help."""
+        """NonFiniteState if the state is not finite, or the last `PATIENCE` steps were bad."""
         if not self._finite:
             raise NonFiniteState("the learner or the curriculum is not finite", self._before)
         if self._bad_steps == PATIENCE:
             raise NonFiniteState(f"{self._why} in {PATIENCE} train steps", self._before)
 
     def require_some_good(self) -> None:
-        """NumbersError if every train step so far was bad: a training that ends has learnt nothing.
+        """NumbersError if every train step was bad; call it at the end of a training.
 
-        A training that is shorter than `PATIENCE` train steps would else end well."""
+        Without it a training shorter than `PATIENCE` train steps would seem to succeed.
+        """
         if self._steps and self._bad_steps == self._steps:
             raise NumbersError(f"{self._why} in all {self._steps} train steps: nothing is learnt")
 
 
 def _nothing_learnt(metrics: dict[str, float]) -> str:
-    """The reason why a train step learnt nothing; empty if it did learn."""
+    """The reason why a train step learnt nothing; empty if it learnt."""
     if metrics["broken"] >= ALL:
         return "every sample was broken"
     return "not one finite gradient" if metrics["ppo/skipped"] >= ALL else ""
 
 
 def leave(config: Config, path: Path, state: TrainState) -> str:
-    """Writes a state with `dump`; returns what to do with it, or why it was not written."""
+    """Writes a state with `dump`. Returns the command that reads it, or the reason of a failure."""
     try:
         dump(path, config, state)
     except OSError as error:
@@ -135,15 +139,17 @@ def leave(config: Config, path: Path, state: TrainState) -> str:
 def with_lower_rate(state: TrainState, attempt: int) -> TrainState:
     """`state` with a lower learning rate and another random key.
 
-    The rate may not rise at once. The other key avoids the same bad numbers."""
+    The rate becomes its own ceiling, so that it rises only slowly. The other key avoids the same
+    bad numbers.
+    """
     rate = state.learner.learning_rate * CAUTION**attempt
-    # A copy: a train step donates its state, which may not hold one buffer twice.
+    # A copy, because a train step donates its state: no buffer may occur twice in it.
     learner = state.learner.replace(learning_rate=rate, rate_ceiling=jnp.copy(rate))
     return state.replace(learner=learner, key=jax.random.fold_in(state.key, attempt))
 
 
 def dump(path: Path, config: Config, state: TrainState) -> None:
-    """Writes a state and its config as one npz, for `python -m kslc_jax.doctor replay`."""
+    """Writes a state and its config to an npz file, for `python -m kslc_jax.doctor replay`."""
     arrays: dict[str, Any] = {
         jax.tree_util.keystr(where): host_array(x) for where, x in jax.tree.leaves_with_path(state)
     }
@@ -153,7 +159,7 @@ def dump(path: Path, config: Config, state: TrainState) -> None:
 
 
 def read_dump(path: Path) -> tuple[Config, TrainState]:
-    """Config and state of a dump; CheckpointError if it is none."""
+    """(config, state) of a dump; CheckpointError if the file is no dump."""
 
     def leaf(where: Any, like: jax.Array) -> jax.Array:
         name = jax.tree_util.keystr(where)

@@ -1,4 +1,4 @@
-"""Steps the state that a failed training left, and shows where the first bad number appears."""
+"""Repeats train steps from the dump of a failed training, and prints the first bad numbers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,14 +16,14 @@ from kslc_jax.train_step import TrainState
 from kslc_jax.training import recovery
 
 Step = tuple[EnvState, EnvState, Trajectory]
-"""Environments after masking, before masking, and the row of the trajectory."""
+"""(environments after masking, environments before masking, row of the trajectory)."""
 
 Roll = Callable[[TrainState, EnvState, jax.Array], Step]
 """One control step: (state, environments, key) -> Step."""
 
 
 def bad_leaves(tree: Any) -> dict[str, np.ndarray]:
-    """Leaves with numbers that are not finite: name to an array of bools, True at these numbers."""
+    """Leaves with non-finite numbers: name -> array of bools, True at these numbers."""
     found = {}
     for path, leaf in jax.tree.leaves_with_path(tree):
         if jnp.issubdtype(leaf.dtype, jnp.floating):

@@ -1,4 +1,4 @@
-"""A run folder: lock, config, versions, and the checks before a training goes on in it."""
+"""A run folder: its lock, config and versions, and the checks before a training resumes in it."""
 
 import contextlib
 import dataclasses
@@ -28,12 +28,14 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-che
 
 
 class RunError(UserError, RuntimeError):
-    """This run folder cannot be used; the message says why and what to do."""
+    """A run folder cannot be used. The message gives the reason and a way out."""
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result depends on; `git` is the commit of this package's own checkout, or
-    "unknown" where the package was installed without one."""
+    """Versions that a result depends on.
+
+    `git` is the commit of this package's own checkout, or "unknown" if it runs from none.
+    """
     found = {name: importlib.metadata.version(name) for name in PACKAGES}
     return {
         "python": platform.python_version(),
@@ -46,10 +48,11 @@ def versions() -> dict[str, str]:
 
 
 def _revision(module: Path) -> str:
-    """Commit of the checkout that holds `module`, a file of this package; empty without one.
+    """Commit of the checkout that holds `module`, a file of this package; empty if there is none.
 
-    The package may be installed within somebody else's repository, whose commit says nothing of
-    this code. So the checkout must hold the package at its top, and git must track the module.
+    The package may be installed inside another repository, and the commit of that repository does
+    not describe this code. So the package must lie at the top of the checkout, and git must track
+    the module.
     """
     package = module.resolve().parents[1]
     top = _git(package, "rev-parse", "--show-toplevel")
@@ -61,8 +64,8 @@ def _revision(module: Path) -> str:
 
 
 def _git(folder: Path, *command: str) -> str:
-    """Output of a git command in `folder`; empty where it fails or git is missing."""
-    # In a git hook these variables name the repository of the hook.
+    """Output of a git command in `folder`; empty if it fails or git is missing."""
+    # Within a git hook these variables point to the hook's repository.
     env = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}
     argv = ["git", "-C", str(folder), *command]
     try:
@@ -74,7 +77,7 @@ def _git(folder: Path, *command: str) -> str:
 
 @contextlib.contextmanager
 def writing(run_dir: Path) -> Generator[None]:
-    """Turns an OSError into a RunError: the run folder cannot be written to."""
+    """Turns an OSError into a RunError that says that the run folder cannot be written."""
     try:
         yield
     except OSError as error:
@@ -84,9 +87,10 @@ def writing(run_dir: Path) -> Generator[None]:
 
 @contextlib.contextmanager
 def locked(run_dir: Path) -> Generator[None]:
-    """Holds the run folder's lock; RunError with the other process's id if another one holds it.
+    """Holds the run folder's lock. If another process holds it, RunError names the process's id.
 
-    The system releases the lock when the process dies."""
+    The operating system releases the lock when the process dies.
+    """
     with writing(run_dir):
         file = (run_dir / files.LOCK).open("a+")
     with file:
@@ -104,17 +108,17 @@ def locked(run_dir: Path) -> Generator[None]:
 
 
 def open_folder(run_dir: Path, config: Config, resume: bool, facts: dict[str, Any]) -> None:
-    """Fills a new run folder, or checks that the training in it can go on.
+    """Writes config and versions into a run folder, after a check of its content.
 
     Args:
-      run_dir: the folder, which is there.
-      config: what is trained.
-      resume: the training in the folder goes on.
-      facts: `circumstances`, and where the training starts from.
+      run_dir: the folder, which must exist.
+      config: config of the training.
+      resume: True: the training in the folder continues.
+      facts: `circumstances`, and the policy that the training starts from, if any.
 
     Raises:
-      RunError: there is no training to go on with, or one that would be lost. A training that
-        ended before its first train step was saved has left nothing to lose.
+      RunError: there is no training to resume, or a new training would overwrite one. A training
+        that ended before it saved its first train step may be overwritten.
       ConfigError: the training in the folder has another config.
     """
     if resume:
@@ -147,18 +151,18 @@ def last_step(run_dir: Path) -> int:
 # ---------------------------------------------------------------------------------- circumstances
 
 RESUMED = "resumed"
-"""Entry of versions.json: a list of what was different each time the training went on, and from
-which train step on. The other entries are those of the training's start."""
+"""Entry of versions.json: a list with the differences at each resume, and its train step. The other
+entries are those of the training's start."""
 
 
 def circumstances(config: Config, devices: int) -> dict[str, Any]:
-    """Everything beside the config that the bits of a training depend on."""
+    """Everything besides the config that can change the bits of a training."""
     engine = physics.resolve_engine(config.physics)
     return versions() | {"engine": engine, "devices": devices}
 
 
 def what_changed(run_dir: Path, facts: dict[str, Any]) -> str:
-    """Says in a few words what is different since the training last ran; empty if nothing is."""
+    """A short description of the differences since the training last ran; empty without any."""
     before = _last_known(run_dir)
     changed = [
         f"{name} {now} instead of {before[name]}"
@@ -182,7 +186,10 @@ def _last_known(run_dir: Path) -> dict[str, Any]:
 
 
 def _stored_versions(run_dir: Path) -> dict[str, Any]:
-    """versions.json; empty if it is missing or damaged, because no number depends on it."""
+    """The content of versions.json; empty if the file is missing or damaged.
+
+    That is no error, because no number depends on the file.
+    """
     try:
         stored = json.loads((run_dir / files.VERSIONS).read_text())
         resumed = stored.get(RESUMED, [])
@@ -200,7 +207,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_config(run_dir: Path) -> Config:
-    """The config stored in a run folder; RunError if there is none, ConfigError if damaged."""
+    """The config in a run folder; RunError if it cannot be read, ConfigError if it is damaged."""
     path = run_dir / files.CONFIG
     try:
         return config_lib.from_dict(json.loads(path.read_text()))
@@ -213,7 +220,7 @@ def read_config(run_dir: Path) -> Config:
 
 
 def difference(stored: Config, wanted: Config) -> None:
-    """ConfigError naming the first field, `run` apart, in which a resumed run would differ."""
+    """ConfigError if the configs differ. It names the first field; the part `run` may differ."""
 
     def walk(a: object, b: object, where: str) -> None:
         if dataclasses.is_dataclass(a):
@@ -228,7 +235,7 @@ def difference(stored: Config, wanted: Config) -> None:
 
 
 def _require_same(run_dir: Path, wanted: Config) -> None:
-    """ConfigError where `difference` raises one; it also says how to begin a new training."""
+    """ConfigError if `difference` raises one. It adds the command that begins a new training."""
     stored = read_config(run_dir)
     try:
         difference(stored, wanted)
@@ -247,6 +254,6 @@ def _require_same(run_dir: Path, wanted: Config) -> None:
 
 
 def _networks(config: Config) -> Any:
-    """Structure and shapes of a config's networks."""
+    """(structure, shapes) of a config's networks."""
     shapes = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
     return jax.tree.structure(shapes), [x.shape for x in jax.tree.leaves(shapes)]

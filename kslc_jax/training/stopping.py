@@ -1,4 +1,4 @@
-"""Signals that stop a training: it finishes its train step, saves, and exits."""
+"""Signals that stop a training. It finishes its train step, saves, and exits."""
 
 import contextlib
 import signal
@@ -11,22 +11,22 @@ INSISTENT = (signal.SIGINT, signal.SIGTERM)
 """Signals that end the process at once if they come a second time."""
 
 SIGNALS = (*INSISTENT, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2, signal.SIGXCPU)
-"""Signals that stop a training. A closed terminal sends SIGHUP; schedulers send the last three some
-time before they kill."""
+"""Signals that stop a training. A closed terminal sends SIGHUP. Schedulers send the last three some
+time before they kill the process."""
 
 SAME_SIGNAL_SECONDS = 1.0
-"""Signals within this time [s] count as one: a scheduler that signals every process of a job
-reaches a training twice, once through the process that started it."""
+"""Signals within this time [s] count as one. A scheduler signals every process of a job. A training
+then gets the signal twice: directly, and from the process that started it."""
 
 Handler = Callable[[int, FrameType | None], None]
 
 
 @contextlib.contextmanager
 def handling(handler: Handler) -> Generator[None]:
-    """Calls `handler` at each of `SIGNALS` within the context.
+    """Within the context, each of `SIGNALS` calls `handler`.
 
-    Python handles signals in the main thread only: in another thread they stay as they are. So does
-    a SIGHUP that is ignored, because nohup wants that.
+    In another thread than the main thread this changes nothing, because Python handles signals in
+    the main thread only. An ignored SIGHUP stays ignored, because nohup needs that.
     """
     main = threading.current_thread() is threading.main_thread()
     old = {s: signal.signal(s, handler) for s in SIGNALS if main and not _under_nohup(s)}
@@ -34,7 +34,7 @@ def handling(handler: Handler) -> Generator[None]:
         yield
     finally:
         for number, before in old.items():
-            # None: not Python's handler but that of a program around it; it cannot be set again.
+            # None: the handler was not set by Python, so Python cannot restore it.
             signal.signal(number, signal.SIG_DFL if before is None else before)
 
 
@@ -43,15 +43,15 @@ def _under_nohup(number: signal.Signals) -> bool:
 
 
 class Stop:
-    """Request to stop; the loop reads it between train steps."""
+    """A request to stop. The loop reads it between train steps."""
 
     def __init__(self) -> None:
         self.requested: str | None = None
-        """Name of the first signal; None before it."""
+        """Name of the first signal; None if there was none."""
         self._since: float | None = None
 
     def handle(self, number: int, _: FrameType | None) -> None:
-        """Notes a signal; KeyboardInterrupt at the second one of `INSISTENT`."""
+        """Records a signal. Raises KeyboardInterrupt at the second signal of `INSISTENT`."""
         self.requested = self.requested or signal.Signals(number).name
         if number in INSISTENT:
             now = time.monotonic()
@@ -62,7 +62,7 @@ class Stop:
 
 @contextlib.contextmanager
 def stop_requests() -> Generator[Stop]:
-    """Turns signals into a request to stop within the context."""
+    """Within the context, signals become a request to stop."""
     stop = Stop()
     with handling(stop.handle):
         yield stop

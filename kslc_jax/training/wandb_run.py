@@ -1,6 +1,6 @@
-"""The records of a training in Weights & Biases: `train --wandb`, with the package wandb.
+"""Sends the records of a training to Weights & Biases: `train --wandb`. Needs the package wandb.
 
-The environment variables of wandb count: WANDB_MODE=offline needs no account and no network.
+The environment variables of wandb apply. WANDB_MODE=offline needs no account and no network.
 """
 
 import contextlib
@@ -18,11 +18,11 @@ from kslc_jax.runtime import first_line
 from kslc_jax.training.logs import finite_values
 
 PROJECT = "kslc_jax"
-"""Project of all trainings, if WANDB_PROJECT names no other."""
+"""Project of all trainings, unless WANDB_PROJECT names another."""
 
 
 def package() -> Any:
-    """The package wandb; MissingPackage that says what to install."""
+    """The package wandb. If it is missing, MissingPackage says what to install."""
     try:
         import wandb
     except ImportError as error:
@@ -31,14 +31,14 @@ def package() -> Any:
 
 
 class WandbRun:
-    """One training as a run of Weights & Biases. No training ends because of it."""
+    """One training as a run of Weights & Biases. Its failures never end the training."""
 
     def __init__(self, run: Any, warn: Callable[[str], None]):
         self._run, self._warn = run, warn
         self._failed = False
 
     def write(self, record: dict[str, float]) -> None:
-        """Sends the values that TensorBoard shows, too. The first failure is told by `warn`."""
+        """Sends the finite values of a record. Only the first failure calls `warn`."""
         try:
             self._run.log(finite_values(record), step=int(record["step"]))
         except Exception as error:  # network, disk, or a bug of the package
@@ -47,7 +47,7 @@ class WandbRun:
             self._failed = True
 
     def close(self, exit_code: int) -> None:
-        """Sends what is left; the run is marked as failed if `exit_code` is not 0."""
+        """Sends the remaining records. An `exit_code` other than 0 marks the run as failed."""
         try:
             self._run.finish(exit_code=exit_code)
         except Exception as error:
@@ -58,7 +58,11 @@ class WandbRun:
 def wandb_run(
     config: Config, run_dir: Path, resume: bool, warn: Callable[[str], None]
 ) -> Generator[WandbRun]:
-    """Opens the run of a training, the same one after a resume; UserError if wandb refuses."""
+    """Opens the wandb run of a training; a resume opens the same run again.
+
+    Raises:
+      UserError: wandb refuses.
+    """
     wandb = package()
     try:
         run = wandb.init(
@@ -83,7 +87,7 @@ def wandb_run(
 
 
 def _run_id(run_dir: Path, resume: bool) -> str:
-    """The id that the run folder keeps, or a new one."""
+    """The id that is stored in the run folder. A new training stores a new one."""
     path = run_dir / files.WANDB_ID
     if resume and path.exists():
         return path.read_text().strip()

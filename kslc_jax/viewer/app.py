@@ -1,6 +1,6 @@
-"""The live viewer. It shows a robot in the browser; the user changes the command while it runs.
+"""The live viewer. The browser shows a robot, and the user changes its command while it runs.
 
-It needs viser (pip install 'kslc_jax[viewer]'). It needs no GL, because the browser draws.
+The viewer needs viser (pip install 'kslc_jax[viewer]'). It needs no GL, because the browser draws.
 """
 
 import collections
@@ -35,7 +35,7 @@ PANEL_HZ = 10
 """Redraws of plots and status text per second."""
 
 GAMMA = 2.2
-"""Exponent from MuJoCo's colours to the linear colours that glTF takes."""
+"""Exponent that turns MuJoCo's colours into the linear colours of glTF."""
 
 CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
 """Start position and target of the camera, relative to the robot [m]; field of view [degrees]."""
@@ -44,17 +44,17 @@ SPEED_SECONDS = 1.0
 """Window for the means of the actual speed and of the real-time factor [s]."""
 
 SHOWN_GROUP = 2
-"""Highest group of the geoms that are drawn, as in MuJoCo's own viewer."""
+"""Highest geom group that is drawn, as in MuJoCo's own viewer."""
 
 SLOW = 0.95
-"""Share of the chosen playback speed. Below it the page says "too slow"."""
+"""Share of the chosen playback speed. At a lower speed the page says "too slow"."""
 
 
 # -------------------------------------------------------------------------------------------- robot
 
 
 def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """The mesh of a geom: in the frame of its body, in the colour of its material."""
+    """The mesh of a geom, in the frame of its body and the colour of its material."""
     kinds, create = mujoco.mjtGeom, trimesh.creation
     size = model.geom_size[geom]
     kind = model.geom_type[geom]
@@ -93,8 +93,8 @@ def mesh_data(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]
 class Figure:
     """The robot and the floor in a viser scene.
 
-    With `follow` the world moves under the robot, and the robot stays in the picture. The user's
-    camera does not move. Without `follow` the world stays and the robot moves.
+    With `follow` the robot stays in the picture and the world moves under it. Without `follow` the
+    world stays and the robot moves. The user's camera never moves by itself.
     """
 
     def __init__(self, server: viser.ViserServer, robot: Robot):
@@ -103,7 +103,7 @@ class Figure:
         self.draw(robot)
 
     def draw(self, robot: Robot) -> None:
-        """Replaces what the scene shows by this robot, which must be of high fidelity."""
+        """Clears the scene and draws this robot, which must have high fidelity."""
         self.robot, model = robot, robot.mj_model
         self._model, self._data = model, mujoco.MjData(model)
         server, scene = self._server, self._server.scene
@@ -158,7 +158,7 @@ class Figure:
 
 
 def policies(given: Path) -> dict[str, Path]:
-    """Folders by name: the given policy, the other checkpoints of its run, the shipped policies."""
+    """Folders by name: the given policy, the other checkpoints of its run, shipped policies."""
     folder = policy_lib.checkpoint_folder(given)
     found = {str(given): folder}
     others = [p for p in folder.parent.iterdir() if p.name.isdigit() and p != folder]
@@ -170,12 +170,13 @@ def policies(given: Path) -> dict[str, Path]:
 
 
 def serve(host: str, port: int) -> viser.ViserServer:
-    """A web server at exactly this address; port 0 takes any free port.
+    """A web server at exactly this address; port 0: any free port.
 
-    ConfigError if the address is not available.
+    Raises:
+      ConfigError: the address is not available.
     """
     try:
-        # Checked here: viser takes the next free port silently, and hangs with an unknown host.
+        # Checked here, because viser silently takes the next free port, and hangs at unknown hosts.
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         socket.create_server((host, port), family=family).close()
     except OSError as error:
@@ -187,7 +188,7 @@ def serve(host: str, port: int) -> viser.ViserServer:
 
 
 def shown_robot(policy: Policy) -> Robot:
-    """The policy's robot at high fidelity: some shapes of the training model must not be seen."""
+    """The policy's robot at high fidelity; the training model has shapes that should be hidden."""
     return robot_lib.load("high", name=policy.config.physics.robot)
 
 
@@ -203,9 +204,11 @@ class Viewer:
         seed: int = 0,
         follow: bool = False,
     ):
-        """Loads the policy and serves the page; nothing moves before `run`.
+        """Loads the policy and serves the page. The robot does not move before `run`.
 
-        With `follow`, `policy` is the run folder of a training; each new policy of it is taken."""
+        With `follow`, `policy` is the run folder of a training. The viewer takes each new policy of
+        this training.
+        """
         self._fidelity: Fidelity = fidelity
         self._seed = seed
         self._follower = Follower(policy) if follow else None
@@ -220,7 +223,7 @@ class Viewer:
         self._play(loaded)
 
     def _play(self, policy: Policy) -> None:
-        """Starts a new session with this policy."""
+        """Starts a new session with the policy, and draws its robot."""
         if self.figure.robot is not shown_robot(policy):
             self.figure.draw(shown_robot(policy))
         self.session = Session(policy, trials.engine(policy, self._fidelity), self._seed)
@@ -229,7 +232,7 @@ class Viewer:
         self._pacer = Pacer(self.session.dt)
         shown = round(panel.PLOT_SECONDS / self.session.dt)
         self._recent: collections.deque[View] = collections.deque(maxlen=shown)
-        self._paced: collections.deque[tuple[float, float, float]]  # s: clock, simulated, asked
+        self._paced: collections.deque[tuple[float, float, float]]  # s: clock, simulated, due
         self._paced = collections.deque(maxlen=round(SPEED_SECONDS * FPS))
         self._drawn = 0.0
         self.reset()
@@ -241,7 +244,7 @@ class Viewer:
         self.figure.show(self.session.view)
 
     def _switch(self, name: str) -> None:
-        """Plays the policy of this name. If loading fails, tells the user and keeps the old one."""
+        """Plays the policy of this name. If it cannot be loaded, keeps the old one and says so."""
         self._name = name
         self.panel.status.content = f"loading {name} ..."
         try:
@@ -251,9 +254,10 @@ class Viewer:
                 client.add_notification("Not loaded", str(error), color="red")
 
     def _take(self, folder: Path) -> None:
-        """Goes on with a newer policy of the training, in mid-motion.
+        """Continues the motion with a newer policy of the training.
 
-        If it cannot be loaded, because the training has removed it, the next one will come."""
+        The training may have removed it already. Then the viewer waits for the next one.
+        """
         try:
             policy = load_policy(folder)
         except CheckpointError:

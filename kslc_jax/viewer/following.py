@@ -1,4 +1,4 @@
-"""The newest policy of a training that is running."""
+"""Finds the newest policy of a running training."""
 
 import math
 import time
@@ -18,15 +18,15 @@ def newest(run_dir: Path) -> Path | None:
         return None
     folders = [run_dir / files.CHECKPOINTS, run_dir / files.SNAPSHOTS]
     found = [path for folder in folders if folder.is_dir() for path in whole_checkpoints(folder)]
-    # Of two of the same train step the snapshot: the training never removes it.
+    # If both exist for a train step, take the snapshot: the training never removes it.
     return max(found, key=lambda p: (int(p.name), p.parent.name == files.SNAPSHOTS), default=None)
 
 
 class Follower:
-    """Names each new policy of one run folder once."""
+    """Returns each new policy of one run folder once."""
 
     def __init__(self, run_dir: Path):
-        """ConfigError if the folder is not that of a training."""
+        """ConfigError if the folder is no run folder of a training."""
         if not (run_dir / files.CONFIG).is_file():
             raise ConfigError(
                 f"--follow: {run_dir} is no run folder of a training (no {files.CONFIG})"
@@ -36,7 +36,7 @@ class Follower:
         self._looked = -math.inf
 
     def wait(self) -> Path:
-        """The folder of the newest policy; waits for the first one."""
+        """The folder of the newest policy. Waits if there is none yet."""
         if newest(self._run_dir) is None:
             print(f"waiting for the first checkpoint in {self._run_dir}", flush=True)
         while (path := self.fresh(time.monotonic())) is None:
@@ -44,7 +44,10 @@ class Follower:
         return path
 
     def fresh(self, now: float) -> Path | None:
-        """The folder of the newest policy if there is a new one at the clock time `now` [s]."""
+        """The folder of a policy that is new since the last call, else None.
+
+        `now` is the clock time [s]. Calls within `LOOK_SECONDS` of a look return None.
+        """
         if now - self._looked < LOOK_SECONDS:
             return None
         self._looked = now

@@ -13,10 +13,10 @@ from kslc_jax.policy import Policy
 from kslc_jax.viewer.session import View
 
 MARGIN = 0.5
-"""Range of the vx slider [m/s] backwards from 0, and forwards beyond the trained range."""
+"""Reach of the vx slider [m/s]: backwards from 0, and forwards beyond the trained range."""
 
 SIDE_MARGIN = 0.2
-"""Range of the vy slider [m/s] beyond the trained range, on each side."""
+"""Reach of the vy slider [m/s] beyond the trained range, on each side."""
 
 RATES = {"0.25x": 0.25, "0.5x": 0.5, "1x": 1.0, "2x": 2.0}
 
@@ -24,10 +24,10 @@ TITLE = "kslc_jax"
 
 PLOT_SECONDS = 6.0
 PLOT_HEIGHT = 130
-"""Pixels."""
+"""Height of a plot [pixels]."""
 
 STEP = np.array([0.25, 0.1, 0.2])
-"""Change of vx, vy [m/s] and yaw rate [rad/s] by one key press."""
+"""Change of vx, vy [m/s] and yaw rate [rad/s] per key press."""
 
 # viser uses W A S D Q E and the arrow keys for the camera.
 WAYS = {
@@ -47,14 +47,14 @@ BLUE, ORANGE, GREEN = "#2d6cdf", "#e8590c", "#2b8a3e"
 
 
 class Panel:
-    """Reads the user's input, and shows plots and text beside the picture."""
+    """Reads the user's input. Shows plots and text beside the picture."""
 
     def __init__(self, server: viser.ViserServer, names: Sequence[str], config: CommandConfig):
         """Builds the controls.
 
         Args:
           server: the viser server of the page.
-          names: of the policies that the user can choose.
+          names: names of the policies that the user can choose.
           config: gives the trained ranges of vy and of the yaw rate.
         """
         self.paused = False
@@ -108,7 +108,7 @@ class Panel:
                 slider.value = float(np.clip(wanted, slider.min, slider.max))
 
     def allow(self, fastest: float) -> None:
-        """Sets the range of vx for a policy trained up to `fastest` [m/s]."""
+        """Sets the range of the vx slider for a policy that was trained up to `fastest` [m/s]."""
         vx = self._sliders[0]
         vx.value = min(vx.value, fastest + MARGIN)
         vx.max = fastest + MARGIN
@@ -117,17 +117,17 @@ class Panel:
 
     @property
     def command(self) -> np.ndarray:
-        """[3] vx, vy [m/s], yaw rate [rad/s]."""
+        """The values of the sliders [3]: vx, vy [m/s], yaw rate [rad/s]."""
         return np.array([slider.value for slider in self._sliders])
 
     def take_reset(self) -> bool:
-        """True if the user asked for a reset after the last call."""
+        """True if the user asked for a reset since the last call."""
         wanted = self._reset_wanted.is_set()
         self._reset_wanted.clear()
         return wanted
 
     def take_push(self, rng: np.random.Generator) -> np.ndarray | None:
-        """A push [2] m/s in a random direction if the user asked for one after the last call."""
+        """A push [2, m/s] in a random direction if the user asked for one since the last call."""
         if not self._push_wanted.is_set():
             return None
         self._push_wanted.clear()
@@ -135,14 +135,14 @@ class Panel:
         return self._push.value * np.array([np.cos(angle), np.sin(angle)])
 
     def title(self, factor: float, slow: bool) -> None:
-        """Shows a slow real-time factor in the title, which a folded panel shows too."""
+        """Shows the real-time factor in the title if it is slow. A folded panel shows its title."""
         title = f"{TITLE}, {factor:.2f}x real time" if slow else TITLE
         if title != self._title:
             self._title = title
             self._gui.set_panel_label(title)
 
     def plot(self, recent: Sequence[View], now: float, dt: float) -> None:
-        """Plots every second view. The views are `dt` [s] apart and end at the time `now` [s]."""
+        """Plots every second view. Views are `dt` [s] apart; the last one is of time `now` [s]."""
         views = recent[::-2][::-1]
         if len(views) < 2:
             return

@@ -1,6 +1,6 @@
-"""Pictures of recorded motion: gait strips and videos, rendered off screen.
+"""Pictures of recorded motion, rendered off screen: gait strips and frames of videos.
 
-Call `runtime.prepare()` before anything that imports mujoco: it chooses the GL library.
+Call `runtime.prepare()` before you import anything that imports mujoco: it chooses the GL library.
 """
 
 import contextlib
@@ -18,10 +18,10 @@ LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
 
 EYE_LEVEL = 0.8
-"""Height [m] that the camera looks at, for XBot-L."""
+"""Height [m] of the point that the camera looks at, for XBot-L."""
 
 TALL = 2.0
-"""Least height that a gait strip shows [m]."""
+"""Least height [m] that a gait strip shows, for XBot-L."""
 
 
 class RenderError(MissingPackage):
@@ -29,7 +29,7 @@ class RenderError(MissingPackage):
 
 
 def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mujoco.Renderer:
-    """An off-screen renderer; RenderError if no GL is chosen, or if it does not work."""
+    """An off-screen renderer; RenderError if no GL is chosen, or if the chosen one fails."""
     chosen = os.environ.get("MUJOCO_GL")
     if not chosen:
         raise RenderError(
@@ -46,7 +46,7 @@ def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mu
 
 
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
-    """A camera at `distance` [m] from the point that the caller sets as `lookat`; in degrees."""
+    """A camera at `distance` [m] from `lookat`, which the caller sets; angles in degrees."""
     cam = mujoco.MjvCamera()
     cam.distance, cam.azimuth, cam.elevation = distance, azimuth, elevation
     return cam
@@ -55,15 +55,15 @@ def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> m
 def frames(
     robot: Robot, qpos: np.ndarray, width: int = 640, height: int = 480, distance: float = 3.0
 ) -> Iterator[np.ndarray]:
-    """Pictures [height, width, 3] of a trajectory [T, 7 + n]. The camera moves with the robot and
-    sees it from the side.
+    """Yields one picture [height, width, 3] per row of a trajectory.
+
+    The camera moves with the robot and shows it from the side.
 
     Args:
-      robot: at high fidelity; some shapes of the training model must not be seen.
-      qpos: trajectory.
-      width, height: of a picture [pixels].
-      distance: of the camera [m] for a robot of XBot-L's height; a smaller robot is seen from
-        nearer.
+      robot: at high fidelity; the training model has shapes that should stay hidden.
+      qpos: [T, 7 + n] trajectory.
+      width, height: size of a picture [pixels].
+      distance: distance of the camera [m] for XBot-L; it scales with the robot's size.
     """
     model, size = robot.mj_model, robot.length_ratio
     data, cam = mujoco.MjData(model), camera(distance * size)
@@ -84,20 +84,22 @@ def gait_strip(
     width: int = 1800,
     height: int = 420,
 ) -> np.ndarray:
-    """One picture: the robot every `interval` seconds on a 1 m floor grid, as the paper's figure.
+    """One picture [height, width, 3] with the robot every `interval` seconds, as in the paper.
+
+    The floor has a grid of 1 m.
 
     Args:
       robot: at high fidelity.
       qpos: [T, 7 + n] trajectory.
       dt: time between two rows of `qpos` [s].
-      interval: time between two robots [s].
-      width, height: of the picture [pixels].
+      interval: time between two images of the robot [s].
+      width, height: size of the picture [pixels].
     """
     model, size = robot.mj_model, robot.length_ratio
     shown = qpos[:: round(interval / dt)]
     middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
     cam = camera(0.0, elevation=-6.0)
-    # A long lens far away shows every robot from the same side. The distance lets all fit in.
+    # A long lens far away shows all images from the same angle. The distance makes all of them fit.
     half_height = np.tan(np.radians(LONG_LENS / 2))
     cam.distance = 0.5 * max(length * height / width, TALL * size) / half_height
     cam.lookat[:] = [middle, shown[:, 1].mean(), EYE_LEVEL * size]
@@ -123,7 +125,7 @@ def gait_strip(
 
 @contextlib.contextmanager
 def _field_of_view(model: mujoco.MjModel, degrees: float) -> Generator[None]:
-    """Gives the model's camera this vertical field of view within the block."""
+    """Within the context, the model's camera has this vertical field of view [degrees]."""
     before, model.vis.global_.fovy = model.vis.global_.fovy, degrees
     try:
         yield
@@ -132,5 +134,5 @@ def _field_of_view(model: mujoco.MjModel, degrees: float) -> Generator[None]:
 
 
 def stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """One picture: the given pictures, all of one width, from top to bottom."""
+    """Stacks pictures of the same width into one, from top to bottom."""
     return np.concatenate(list(pictures))

@@ -1,6 +1,7 @@
-"""One environment under a policy. The command may change at any step.
+"""One environment with a policy. The command may change at any step.
 
-This module has no window and no clock: `Session` steps, and `Pacer` counts the steps that are due.
+This module has no window and reads no clock. `Session` does control steps. `Pacer` computes how
+many control steps are due.
 """
 
 import functools
@@ -21,19 +22,26 @@ FALLEN_SECONDS = 1.0
 """Time that a fallen robot lies still before the next episode starts."""
 
 EPSILON = 1e-5
-"""Share by which the slowest command lies above the dead zone, in float32."""
+"""Relative distance of the slowest command above the dead zone, large enough for float32."""
 
 
 STOP = 0.9
-"""Share of the dead zone below which a walking robot stops."""
+"""Share of the dead zone. A walking robot stops at commands below it."""
 
 
 def steady(velocity: np.ndarray, walks: bool, dead_zone: float) -> tuple[np.ndarray, bool]:
-    """A command [3] that does not start and stop the robot at each trembling of a joystick at the
-    edge of the dead zone [m/s], and True if the robot is to walk.
+    """Steadies a command at the edge of the dead zone, where a joystick may tremble.
 
-    Walking begins above the dead zone and ends below `STOP` of it. In between a walking robot is
-    asked for the edge, the slowest command of the training.
+    Walking begins above the dead zone and ends below `STOP` times it. In between, a walking robot
+    gets the slowest command of the training, at the edge of the dead zone.
+
+    Args:
+      velocity: [3] wanted vx, vy [m/s], yaw rate [rad/s].
+      walks: True if the robot walked in the last step.
+      dead_zone: of the training's commands [m/s].
+
+    Returns:
+      (command [3], True if the robot must walk).
     """
     speed = float(np.hypot(*velocity[:2]))
     if not speed > dead_zone * (STOP if walks else 1.0):
@@ -44,19 +52,19 @@ def steady(velocity: np.ndarray, walks: bool, dead_zone: float) -> tuple[np.ndar
 
 @flax.struct.dataclass
 class View:
-    """The values of one control step that the viewer shows. Feet: left, right."""
+    """The values of one control step that the viewer shows."""
 
     qpos: jax.Array  # [7 + n]
     command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
     velocity: jax.Array  # [3] actual vx, vy [m/s], yaw rate [rad/s]; base frame
     phase: jax.Array  # [] share of the gait cycle
-    contact: jax.Array  # [2] bool
+    contact: jax.Array  # [2] bool, left and right foot
     fallen: jax.Array  # [] bool
 
 
 @flax.struct.dataclass
 class Memory:
-    """The state that a session carries from step to step."""
+    """State of a session between two control steps."""
 
     env: env.EnvState
     heading: jax.Array  # [] rad, commanded while the commanded yaw rate is 0
@@ -129,7 +137,9 @@ class Session:
         return self.view
 
     def advance(self, command: np.ndarray, push: np.ndarray | None = None) -> View:
-        """Does one control step. A fallen robot lies still for a second; then an episode starts.
+        """Does one control step. After a fall the view stays for `FALLEN_SECONDS`.
+
+        Then a new episode starts.
 
         Args:
           command: [3] vx, vy [m/s], yaw rate [rad/s], base frame.
@@ -157,10 +167,10 @@ class Session:
 
 
 class Pacer:
-    """Counts the steps of `dt` [s] that are due, so that simulated time follows the clock."""
+    """Computes how many steps of `dt` [s] are due, so that simulated time follows the clock."""
 
     def __init__(self, dt: float, longest: float = 0.1):
-        """A slow simulation falls behind the clock. It drops the lag above `longest` [s]."""
+        """If a slow simulation lags behind the clock, it skips the lag above `longest` [s]."""
         self._dt, self._longest = dt, longest
         self._last: float | None = None
         self._owed = 0.0
