@@ -1,4 +1,4 @@
-"""Numbers of a robot without a simulation: torques while it stands, contacts, the reference motion."""
+"""Numbers of a robot without a simulation: standing torques, contacts, the reference motion."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ import numpy as np
 from kslc_jax import commands, gait
 from kslc_jax.config import Config
 from kslc_jax.robot import Robot
-from kslc_jax.robots.build import SIDES
+from kslc_jax.robots.build import SIDES, TOUCH_BORDER
 from kslc_jax.robots.contacts import PAIR_MARGIN
 
 POSES = 400
@@ -43,6 +43,11 @@ def sole_centre(robot: Robot, data: mujoco.MjData, side: str) -> np.ndarray:
     return data.site(f"{side}_foot").xpos
 
 
+def sole_size(robot: Robot, side: str) -> np.ndarray:
+    """[2] m, half the length and half the width."""
+    return robot.mj_model.site(f"{side}_foot").size[:2] - TOUCH_BORDER
+
+
 def standing_torque(robot: Robot) -> np.ndarray:
     """Torques [n, N m] that hold the home pose while each foot carries half of the weight.
 
@@ -53,9 +58,9 @@ def standing_torque(robot: Robot) -> np.ndarray:
     torque = data.qfrc_bias - data.qfrc_passive
     for side in SIDES:
         site = model.site(f"{side}_foot")
-        point = data.site_xpos[site.id] + data.site_xmat[site.id].reshape(3, 3)[:, 0] * np.clip(
-            data.sensor("com").data[0] - data.site_xpos[site.id][0], -site.size[0], site.size[0]
-        )
+        centre, forward = data.site_xpos[site.id], data.site_xmat[site.id].reshape(3, 3)[:, 0]
+        reach = sole_size(robot, side)[0]
+        point = centre + forward * np.clip(data.sensor("com").data[0] - centre[0], -reach, reach)
         jacobian = np.zeros((3, model.nv))
         mujoco.mj_jac(model, data, jacobian, None, point, int(site.bodyid[0]))
         torque -= jacobian[2] * robot.total_mass * 9.81 / 2
@@ -66,14 +71,14 @@ def off_balance(robot: Robot) -> float:
     """Distance [m] of the centre of mass in front of the toes (> 0) or behind the heels (< 0) at
     home; 0 above the soles."""
     data = posed(robot, robot.default_qpos)
-    reach = [robot.mj_model.site(f"{side}_foot").size[0] for side in SIDES]
+    reach = [sole_size(robot, side)[0] for side in SIDES]
     centre = [sole_centre(robot, data, side)[0] for side in SIDES]
     x = data.sensor("com").data[0]
     toe, heel = np.max(np.add(centre, reach)), np.min(np.subtract(centre, reach))
     return float(max(x - toe, 0.0) + min(x - heel, 0.0))
 
 
-# ------------------------------------------------------------------------------------------ contacts
+# ----------------------------------------------------------------------------------------- contacts
 
 
 def link_names(robot: Robot, contact: mujoco.MjContact) -> tuple[str, str]:
@@ -124,14 +129,17 @@ def unfelt(train: Robot, high: Robot) -> tuple[int, int]:
 # --------------------------------------------------------------------------------- reference motion
 
 
-def reference(config: Config, robot: Robot, speed: float, phase: float) -> np.ndarray:
-    """Reference angles [n, rad] from home at a commanded speed [m/s] and a phase in [0, 1)."""
-    velocity = jnp.array([speed, 0.0, 0.0])
-    command = commands.Command(velocity, jnp.zeros(()), jnp.ones((), bool))
-    state = gait.init(config.gait, jax.random.key(0), command, jnp.zeros(2))
-    angle = 2 * np.pi * phase
-    state = state.replace(clock=jnp.array([np.sin(angle), np.cos(angle)]))
-    return np.asarray(gait.reference_pose(config.gait, robot, state, command))
+def reference(config: Config, robot: Robot, speed: float, phases: np.ndarray) -> np.ndarray:
+    """Reference angles [..., n, rad] from home at a commanded speed [m/s] and phases [...] in
+    [0, 1)."""
+    command = commands.Command(jnp.array([speed, 0.0, 0.0]), jnp.zeros(()), jnp.ones((), bool))
+    start = gait.init(config.gait, jax.random.key(0), command, jnp.zeros(2))
+
+    def one(angle: jax.Array) -> jax.Array:
+        state = start.replace(clock=jnp.stack([jnp.sin(angle), jnp.cos(angle)]))
+        return gait.reference_pose(config.gait, robot, state, command)
+
+    return np.asarray(jnp.vectorize(one, signature="()->(n)")(2 * np.pi * jnp.asarray(phases)))
 
 
 def out_of_range(config: Config, robot: Robot) -> np.ndarray:
@@ -139,21 +147,22 @@ def out_of_range(config: Config, robot: Robot) -> np.ndarray:
     at the fastest reference."""
     endless = np.full(robot.count, np.inf)
     free = dataclasses.replace(robot, joint_lower=-endless, joint_upper=endless)
+    phases = np.arange(PHASES) / PHASES
     beyond = [
-        np.abs(reference(config, free, speed, phase) - reference(config, robot, speed, phase))
+        np.abs(reference(config, free, speed, phases) - reference(config, robot, speed, phases))
         for speed in (0.0, config.gait.full_speed)
-        for phase in np.arange(PHASES) / PHASES
     ]
-    return np.max(beyond, axis=0)
+    return np.max(beyond, axis=(0, 1))
 
 
 def foot_lift(config: Config, robot: Robot) -> float:
     """Height [m] of the swing foot above the stance foot in the middle of the reference's swing, at
     commanded speed 0; the smaller one of left and right."""
     lifts = []
-    for side, phase in (("left", 0.75), ("right", 0.25)):
+    swings = reference(config, robot, 0.0, np.array([0.75, 0.25]))
+    for side, swing in zip(SIDES, swings, strict=True):
         qpos = robot.default_qpos.copy()
-        qpos[7:] += reference(config, robot, 0.0, phase)
+        qpos[7:] += swing
         data = posed(robot, qpos)
         left, right = (data.sensor(f"{name}_foot_pos").data[2] for name in SIDES)
         lifts.append(left - right if side == "left" else right - left)

@@ -39,8 +39,9 @@ def fall_time(robot: Robot) -> float:
     model = copy.copy(robot.mj_model)
     data = mujoco.MjData(model)
     data.qpos[:] = robot.default_qpos
+    dynamics = _nominal(robot)
     while data.time < STAND_SECONDS:
-        _hold(robot, model, data)
+        _hold(robot, dynamics, model, data)
         if _torso_height(robot, data) < 0 or not np.isfinite(data.qpos).all():
             return float(data.time)
     return math.inf
@@ -60,17 +61,23 @@ def sag(robot: Robot) -> np.ndarray:
     data = mujoco.MjData(model)
     data.qpos[:] = robot.default_qpos
     data.qpos[2] += HANG_HEIGHT
+    dynamics = _nominal(robot)
     while data.time < HANG_SECONDS:
-        _hold(robot, model, data)
+        _hold(robot, dynamics, model, data)
     return data.qpos[7:] - robot.default_qpos[7:]
 
 
-def _hold(robot: Robot, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+def _nominal(robot: Robot) -> randomize.Dynamics:
+    """The described robot, in numpy."""
+    return jax.tree.map(np.asarray, randomize.nominal(robot))
+
+
+def _hold(
+    robot: Robot, dynamics: randomize.Dynamics, model: mujoco.MjModel, data: mujoco.MjData
+) -> None:
     """One physics step with the home pose as target, in place."""
-    dynamics = jax.tree.map(np.asarray, randomize.nominal(robot))
-    target = robot.default_qpos[7:]
     _, data.ctrl[:], model.actuator_biasprm[:, SERVO_DAMPING] = drive(
-        robot, dynamics, data.qpos[7:], data.qvel[6:], target, np
+        robot, dynamics, data.qpos[7:], data.qvel[6:], robot.default_qpos[7:], np
     )
     mujoco.mj_step(model, data)
 
