@@ -4,6 +4,7 @@ import dataclasses
 import math
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -100,7 +101,7 @@ def test_contacts_in_random_poses(biped, monkeypatch):
     missed, there = statics.unfelt(biped.train, biped.high)
     assert 0 == missed < there
     deaf = robot.load(name=BIPED, iterations=7)  # another model than the fixture's
-    deaf.mj_model.pair_margin[:] = -1.0
+    deaf.mj_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     assert statics.unfelt(deaf, biped.high) == (there, there)
 
 
@@ -118,6 +119,12 @@ def test_nothing_is_wrong_with_these(name):
 
 CASES = {
     "gains": ('"lock" = { kp = 30 }\n', (), "motors: kp", "port_lock, star_lock: standing"),
+    "stiff ankles": (
+        '"rudder" = { kp = 12 }\n',
+        (),
+        "motors: kp",
+        "the ankles have 0.34 of the stiffness that stands by itself",
+    ),
     "effort": (
         '"lock" = { effort = 11 }\n',
         (),

@@ -14,6 +14,10 @@ SAG = 0.15
 """Largest angle [rad] by which standing may bend a hip or a knee; XBot-L's knees: 0.105. A quarter
 of a radian is too much: H1's knees with unitree_rl_gym's gains, which do not carry it."""
 
+ANKLES = 0.3
+"""Largest stiffness of the ankles as a share of that which stands by itself. XBot-L, 0.08, and a G1
+with 0.14 learnt to walk; a G1 with 0.37, and with straighter knees, learnt to stand."""
+
 SCALE = (0.03, 1.5)
 """Torque of one action, kp x action_scale, as a share of the largest torque; XBot-L's: 0.044 at the
 ankles, 0.59 at the hips."""
@@ -80,6 +84,17 @@ def weak_gains(x: Patient) -> Iterator[Finding]:
             yield Finding(
                 "motors: kp", f"{names}: standing bends it by {value:.2f} rad, at most {SAG:g}"
             )
+
+
+def stiff_ankles(x: Patient) -> Iterator[Finding]:
+    """Ankles on which a robot learns to stand, not to step."""
+    share = statics.ankle_share(x.train)
+    if share > ANKLES:
+        yield Finding(
+            "motors: kp",
+            f"the ankles have {share:.2f} of the stiffness that stands by itself: it may learn to "
+            f"stand, not to step; soften them (at most {ANKLES:g}; XBot-L: 0.08)",
+        )
 
 
 def weak_motors(x: Patient) -> Iterator[Finding]:
@@ -218,6 +233,7 @@ def reference(x: Patient) -> Iterator[Finding]:
 
 STATIC: tuple[Callable[[Patient], Iterator[Finding]], ...] = (
     weak_gains,
+    stiff_ankles,
     weak_motors,
     action_scale,
     masses,

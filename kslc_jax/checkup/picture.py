@@ -160,13 +160,13 @@ def _joint(
         axis.plot(*place, marker="o", color="white", markeredgecolor=colour, markersize=9)
         axis.plot(*place, marker=inside, color=colour, markersize=5)
     else:
-        style = {"color": colour, "arrowstyle": "-|>", "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
-        axis.annotate("", place + along, place, arrowprops=style)
+        arrow = {"arrowstyle": "-|>", "linewidth": 1.6, "shrinkA": 0, "shrinkB": 0}
+        axis.annotate("", place + along, place, arrowprops=arrow | {"color": colour})
         axis.plot(*place, marker="o", color=colour, markersize=3)
     role = next((r for r, j in robot.anatomy.roles.items() if j == joint), "").partition("_")[2]
     if towards[1] and role in LABELS:
-        style = {"textcoords": "offset points", "ha": "right", "fontsize": 9, "weight": "bold"}
-        axis.annotate(role, place, (-9, 4), **style)
+        label = axis.annotate(role, place, (-9, 4), textcoords="offset points", ha="right")
+        label.set(fontsize=9, weight="bold")
 
 
 def _legend(robot: Robot) -> list[Patch | Line2D]:

@@ -142,7 +142,7 @@ def axis_name(axis: np.ndarray) -> str:
 
 def motors(it: Robot) -> Table:
     """Motors in the order of the actions."""
-    table = _table("motors: N m/rad, N m s/rad, N m, rad/s, kg m^2; standing: N m at home")
+    table = _table("motors, in SI units; standing: torque at home")
     for column in ("#", "joint", "kp", "kd", "effort", "speed", "armature", "standing", "sag"):
         table.add_column(column, justify="left" if column in ("#", "joint") else "right")
     for row in motor_rows(it):
@@ -192,14 +192,19 @@ def fact_rows(x: Patient) -> list[tuple[str, str]]:
             f"{2 * sole[0]:.3f} m x {2 * sole[1]:.3f} m, {it.sole_drop:.3f} m below the ankle, "
             f"{tilt(it):.1f} degrees from level",
         ),
+        ("ankles", f"{statics.ankle_share(it):.2f} of the stiffness that stands by itself"),
         ("feet, knees apart", f"{it.feet_apart:.3f} m, {it.knees_apart:.3f} m"),
         ("contacts in training", f"{count} pairs of {parts} parts, and the soles"),
         ("observations", f"actor {widths[0]}, critic {widths[1]}"),
         (
             "laptop preset",
             f"gait cycle {config.gait.cycle_time:g} s, commands up to "
-            f"{config.curriculum.v_limit:g} m/s, feet lift by {config.rewards.clearance_target:g} m"
-            f" (reference: {statics.foot_lift(config, it):.3f} m)",
+            f"{config.curriculum.v_limit:g} m/s",
+        ),
+        (
+            "feet lift",
+            f"{statics.foot_lift(config, it):.3f} m in the reference motion, target "
+            f"{config.rewards.clearance_target:.3f} m",
         ),
     ]
 

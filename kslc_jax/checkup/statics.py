@@ -67,6 +67,14 @@ def standing_torque(robot: Robot) -> np.ndarray:
     return torque[6:]
 
 
+def ankle_share(robot: Robot) -> float:
+    """Stiffness of both ankles, as a share of that with which a rigid robot would stand on them:
+    its weight times the height of its centre of mass."""
+    data = posed(robot, on_the_ground(robot))
+    ankles = [robot.anatomy.roles[f"{side}_ankle"] for side in SIDES]
+    return float(robot.kp[ankles].sum() / (robot.total_mass * 9.81 * data.sensor("com").data[2]))
+
+
 def off_balance(robot: Robot) -> float:
     """Distance [m] of the centre of mass in front of the toes (> 0) or behind the heels (< 0) at
     home; 0 above the soles."""
