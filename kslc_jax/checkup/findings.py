@@ -28,7 +28,7 @@ LIGHT = 0.001
 STIFF = 1.0
 """kd x timestep / inertia from which a joint without armature is hard to simulate."""
 
-UNEQUAL = 0.02
+UNEQUAL = 0.05
 """Largest relative difference of the numbers of a left and a right joint; XBot-L's ankles differ
 more in mass, so masses below `SMALL` do not count."""
 
