@@ -30,7 +30,7 @@ test: $(STAMP) ## Quick test suite, a few minutes
 test-all: $(STAMP) ## All tests, slow ones too
 	@$(BIN)/python -m pytest -m "" $(ARGS)
 
-test-notebooks: $(STAMP) ## Executes the three notebooks, shortened: a few minutes
+test-notebooks: $(STAMP) ## Executes the four notebooks, shortened: a few minutes
 	@$(BIN)/python -m pytest -n 2 -m "" tests/test_notebooks.py $(ARGS)
 
 lint: $(STAMP) ## ruff and ty

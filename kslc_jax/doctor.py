@@ -1,12 +1,16 @@
-"""Checks this machine, and replays a failed training.
+"""Checks this machine or a robot, and replays a failed training.
 
 python -m kslc_jax.doctor checks versions, devices, both physics engines against each other, the
 renderer, disk, cache and cores, and says how to fix what fails; exit code 1 if something does.
+python -m kslc_jax.doctor robot NAME reads the description of a robot (docs/own_robot.md), shows
+what follows from it as tables and as a picture, lets the robot stand without a policy, and says
+what looks wrong and which field to change; exit code 0 also then, 2 if the robot cannot be used.
 python -m kslc_jax.doctor replay DUMP steps the state that a failed training left (bad_state.npz in
 its run folder) again, and shows where the first non-finite number appears.
 """
 
 import importlib.metadata
+import math
 import os
 import platform
 import shutil
@@ -16,24 +20,19 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from kslc_jax import cli, runtime
-from kslc_jax.config import ConfigError, PhysicsConfig
+from kslc_jax.config import ConfigError
 
 PYTHONS = ((3, 11), (3, 13))
 """Oldest and newest Python this is tested with."""
 
 TESTED = " to ".join(f"{major}.{minor}" for major, minor in PYTHONS)
-
-AGREEMENT = 1e-4
-"""Difference [rad] between the engines' joint angles after `AGREEMENT_STEPS` control steps."""
-
-AGREEMENT_STEPS = 20
 
 FREE_DISK = 2.0
 """Free space [GiB] for run folders and the compilation cache."""
@@ -42,6 +41,18 @@ FREE_DISK = 2.0
 @dataclass(frozen=True)
 class Check:
     """Check this machine."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """Show what follows from a robot's description, and what looks wrong with it."""
+
+    name: tyro.conf.Positional[str]
+    """A shipped robot, such as unitree_g1, or the path of a description, such as my/robot.toml."""
+    picture: Path | None = None
+    """Draws limbs, joint axes, soles and trunk at home into this file, such as robot.png."""
+    engines: bool = True
+    """Compare MJX with C MuJoCo; it compiles for a minute or more."""
 
 
 @dataclass(frozen=True)
@@ -84,36 +95,17 @@ def check_devices() -> str:
 
 def check_engines() -> str:
     """The engines' versions, and the distance between their motions."""
-    import numpy as np
+    from kslc_jax.checkup import findings, trials
 
-    a, b = _joint_angles("mujoco"), _joint_angles("mjx")
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
+    apart = trials.engines_apart("xbot_l")
+    if math.isnan(apart):
         raise RuntimeError("an engine gives numbers that are not finite")
-    apart = float(np.abs(a - b).max())
-    if apart > AGREEMENT:
-        raise RuntimeError(f"engines are {apart:.1e} rad apart after {AGREEMENT_STEPS} steps")
+    if apart > findings.AGREEMENT:
+        raise RuntimeError(
+            f"engines are {apart:.1e} rad apart after {trials.AGREEMENT_STEPS} steps"
+        )
     version = importlib.metadata.version
     return f"mujoco {version('mujoco')}, mjx {version('mujoco-mjx')}: {apart:.0e} rad apart"
-
-
-def _joint_angles(engine: Literal["mujoco", "mjx"]):
-    """Joint angles [n] after some control steps from standing."""
-    import jax
-    import jax.numpy as jnp
-
-    from kslc_jax import physics, randomize
-
-    config = PhysicsConfig(engine=engine, iterations=10, ls_iterations=10)
-    robot = physics.robot_for(config)
-    home = jnp.asarray(robot.default_qpos, jnp.float32)
-    start = physics.initial_state(config, home, jnp.zeros(home.size - 1))
-
-    def one(state: Any, t: jax.Array) -> tuple[Any, None]:
-        target = home[7:] + 0.05 * jnp.sin(0.2 * t + jnp.arange(robot.count))
-        return physics.step(config, state, target, randomize.nominal(robot), 1.0), None
-
-    run = jax.jit(lambda state: jax.lax.scan(one, state, jnp.arange(AGREEMENT_STEPS))[0])
-    return jax.device_get(run(start).qpos[7:])
 
 
 def check_renderer() -> str:
@@ -186,13 +178,18 @@ def check() -> int:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    kinds: Any = Check | Replay
+    kinds: Any = Check | Robot | Replay
     return cli.run(lambda: _run(cli.parse("doctor", kinds, argv, __doc__, default=Check())))
 
 
-def _run(args: Check | Replay) -> int:
+def _run(args: Check | Robot | Replay) -> int:
     if isinstance(args, Check):
         return check()
+    if isinstance(args, Robot):
+        from kslc_jax.checkup import report
+
+        report.check(args.name, args.picture, args.engines)
+        return 0
     from kslc_jax.training.replay import replay
 
     replay(args.dump, args.steps)

@@ -41,6 +41,7 @@ from kslc_jax import (
 )
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
+from kslc_jax.checkup import trials
 from kslc_jax.config import preset, to_dict
 from kslc_jax.robots import description
 from kslc_jax.training import recovery, run_folder
@@ -1005,9 +1006,7 @@ class TestDoctor:
         monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path / "file"))
         monkeypatch.setattr(jax, "__version__", "0.11.0")
         monkeypatch.setattr(doctor, "FREE_DISK", 1e9)
-        monkeypatch.setattr(
-            doctor, "_joint_angles", lambda engine: np.full(16, 0.0 if engine == "mjx" else 1e-3)
-        )
+        monkeypatch.setattr(trials, "engines_apart", lambda name: 1e-3)
         for check in (doctor.check_cache, doctor.check_jax, doctor.check_disk):
             with pytest.raises((OSError, RuntimeError)):
                 check()

@@ -12,7 +12,7 @@ import pytest
 from kslc_jax import plots, rewards
 
 ROOT = Path(__file__).parents[1]
-NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum")
+NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum", "04_own_robot")
 
 MOST_BYTES = 1_000_000
 MOST_LINES = 16
@@ -121,6 +121,19 @@ def test_rewards_and_curriculum(execute):
     assert pictures(notebook) == 13
 
 
+@pytest.mark.slow(reason="a minute: a training, and the doctor twice")
+def test_own_robot(execute, tmp_path, monkeypatch):
+    """The tests' biped in place of the G1, which may need a download. Stiff ankles are found."""
+    monkeypatch.setenv("KSLC_ROBOT", str(ROOT / "tests" / "data" / "biped.toml"))
+    notebook = execute("04_own_robot")
+    said = text(notebook)
+    assert "nothing looks wrong" in said and "soften them" in said
+    assert re.search(r"gait.cycle_time +XBot-L +0.64 +biped +0.52", said)
+    assert pictures(notebook) == 2
+    records = plots.read_metrics(tmp_path / "runs" / "notebook-own-robot")
+    assert list(records["step"]) == [1, 2, 3, 4]
+
+
 def test_the_reward_terms_shown_are_there_and_told():
     """The notebook plots each of the paper's four terms alone. The other terms share figures, and
     each has a sentence."""
@@ -143,7 +156,7 @@ def test_without_a_checkout_the_address_is_asked_for(tmp_path, monkeypatch):
     first, *others = (
         [cell for cell in read(name).cells if "git clone" in cell.source] for name in NAMES
     )
-    assert [[cell.source for cell in cells] for cells in others] == [[first[0].source]] * 2
+    assert [[cell.source for cell in cells] for cells in others] == [[first[0].source]] * 3
     notebook = nbformat.v4.new_notebook(cells=first)
     client = nbclient.NotebookClient(notebook, resources={"metadata": {"path": str(tmp_path)}})
     with pytest.raises(nbclient.exceptions.CellExecutionError) as error:

@@ -22,7 +22,7 @@ def _name(path: Path) -> str:
 
 MODULES = {_name(path): path for path in sorted(ROOT.rglob("*.py"))}
 
-WINGS = ("kslc_jax.evaluation", "kslc_jax.viewer")
+WINGS = ("kslc_jax.evaluation", "kslc_jax.viewer", "kslc_jax.checkup")
 COMMANDS = tuple(f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "play", "export"))
 NO_TRAINING = [n for n in MODULES if n.startswith(WINGS) or n in ("kslc_jax.policy", *COMMANDS)]
 

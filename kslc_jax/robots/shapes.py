@@ -41,13 +41,13 @@ def surface(source: Source, geoms: list[int]) -> np.ndarray:
     """[k, 3] points on the surfaces of these geoms, world at home [m]."""
     data = source.data
     clouds = [
-        _points(source.model, geom) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
+        points(source.model, geom) @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
         for geom in geoms
     ]
     return np.concatenate(clouds) if clouds else np.zeros((0, 3))
 
 
-def _points(model: mujoco.MjModel, geom: int) -> np.ndarray:
+def points(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """[k, 3] points on one geom's surface, in its frame; corners and vertices are among them."""
     kind, size = int(model.geom_type[geom]), model.geom_size[geom]
     if kind == _MESH:
