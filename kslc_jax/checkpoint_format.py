@@ -109,7 +109,7 @@ def changed_robot(meta: dict[str, Any]) -> str:
 
 def _robot_name(meta: dict[str, Any]) -> str:
     """`physics.robot` of the stored config. Configs without the field are of XBot-L."""
-    return meta["config"].get("physics", {}).get("robot", robot_lib.XBOT_L)
+    return meta["config"].get("physics", {}).get("robot", config_lib.XBOT_L)
 
 
 def _robot(name: str) -> dict[str, Any]:

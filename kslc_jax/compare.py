@@ -25,10 +25,9 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kslc_jax import cli, evaluate, files, plots, similar
+from kslc_jax import cli, evaluate, files, plots, train
 from kslc_jax import config as config_lib
-from kslc_jax.config import Config, ConfigError, Fidelity
-from kslc_jax.robot import XBOT_L
+from kslc_jax.config import XBOT_L, Config, ConfigError, Fidelity
 from kslc_jax.training import stopping
 
 WIDTH = 200
@@ -76,7 +75,7 @@ class Args:
         if unknown:
             raise ConfigError(f"variants: unknown {unknown[0]!r} (known: {', '.join(VARIANTS)})")
         for name in (self.preset, self.baseline):
-            similar.preset(name, self.robot)
+            train.preset_for(name, self.robot)
         for name in ("steps", "snapshots", "trials"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be at least 1")
@@ -114,7 +113,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     preset = args.baseline if variant == "baseline" else args.preset
     parts = (ablation,) if ablation else ()
     without = ("--without", *parts) if parts else ()
-    config = dataclasses.replace(similar.preset(preset, args.robot, parts), seed=seed)
+    config = dataclasses.replace(train.preset_for(preset, args.robot, parts), seed=seed)
     of = () if args.robot == XBOT_L else ("--robot", args.robot)
     what = (*of, "--preset", preset, *without, "--seed", str(seed))
     length = ("--steps", str(args.steps), "--run.snapshots", str(args.snapshots))

@@ -13,12 +13,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from kslc_jax.config import Fidelity
+from kslc_jax.config import XBOT_L, Fidelity
 from kslc_jax.robots import anatomy, build, description
 from kslc_jax.robots.anatomy import Anatomy
-
-XBOT_L = "xbot_l"
-"""The robot of the paper. Presets are made for it; `mass_ratio` and `length_ratio` refer to it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ DIGITS = 3
 """Significant digits of a scaled number: more would claim an accuracy that similarity lacks."""
 
 
-def preset(name: str, robot: str = robot_lib.XBOT_L, without: tuple[str, ...] = ()) -> Config:
+def preset(name: str, robot: str = config_lib.XBOT_L, without: tuple[str, ...] = ()) -> Config:
     """The named preset for a robot: scaled, then with the [config] of the robot's description.
 
     Args:

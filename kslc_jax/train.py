@@ -27,11 +27,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from kslc_jax import cli, runtime, similar
+from kslc_jax import cli, runtime
 from kslc_jax import config as config_lib
-from kslc_jax.config import Config, ConfigError
+from kslc_jax.config import XBOT_L, Config, ConfigError
 from kslc_jax.errors import UserError
-from kslc_jax.robot import XBOT_L
 
 if TYPE_CHECKING:
     from jax.sharding import Mesh
@@ -118,6 +117,15 @@ def cluster(
     return coordinator, counts[0], counts[1]
 
 
+def preset_for(name: str, robot: str, without: tuple[str, ...] = ()) -> Config:
+    """`similar.preset`. It loads MuJoCo only for another robot than XBot-L, so --help is quick."""
+    if robot == XBOT_L:
+        return config_lib.preset(name, without)
+    from kslc_jax import similar
+
+    return similar.preset(name, robot, without)
+
+
 def parse(argv: list[str]) -> Args:
     """Reads the command line.
 
@@ -144,7 +152,7 @@ def parse(argv: list[str]) -> Args:
         base = run_folder.read_config(known.run_dir)
     else:  # also on a resume with a preset: run_folder names the first field that differs
         name, robot = known.preset or DEFAULT, known.robot or XBOT_L
-        base = similar.preset(name, robot, tuple(known.without))
+        base = preset_for(name, robot, tuple(known.without))
     args = cli.parse("train", Args, argv, __doc__, default=Args(config=base))
     if args.resume and args.start_from:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")

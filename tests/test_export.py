@@ -29,10 +29,9 @@ from kslc_jax import (
     observations,
     physics,
     randomize,
-    robot,
 )
 from kslc_jax import policy as policy_lib
-from kslc_jax.config import ConfigError, PhysicsConfig, preset
+from kslc_jax.config import XBOT_L, ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import trials
 from kslc_jax.robots import description
 
@@ -392,7 +391,7 @@ def test_the_checker_names_the_first_wrong_target(runner, checker, contracted):
 
 
 def test_the_runner_refuses_a_timestep_that_does_not_fill_the_control_step(runner, onnx_file):
-    model = mujoco.MjModel.from_xml_path(str(description.read(robot.XBOT_L).mjcf))
+    model = mujoco.MjModel.from_xml_path(str(description.read(XBOT_L).mjcf))
     controller = runner.Controller(onnx_file, 0.0)
     for timestep in (0.003, 0.004, 0.0015, 0.02):
         model.opt.timestep = timestep

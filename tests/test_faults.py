@@ -42,7 +42,7 @@ from kslc_jax import (
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.checkup import trials
-from kslc_jax.config import preset, to_dict
+from kslc_jax.config import XBOT_L, preset, to_dict
 from kslc_jax.robots import description
 from kslc_jax.training import recovery, run_folder
 from kslc_jax.training.checkpoint import Store
@@ -778,11 +778,11 @@ def edit_robot(tmp_path, monkeypatch):
     """Changes the robot's MJCF, for this process, from one text to another."""
 
     def edit(old: str, new: str) -> None:
-        text = description.read(robot.XBOT_L).mjcf.read_text()
+        text = description.read(XBOT_L).mjcf.read_text()
         assert old in text
         path = tmp_path / "robot.xml"
         path.write_text(text.replace(old, new, 1))
-        described = dataclasses.replace(description.read(robot.XBOT_L), mjcf=path)
+        described = dataclasses.replace(description.read(XBOT_L), mjcf=path)
         monkeypatch.setattr(description, "read", lambda name: described)
         monkeypatch.setattr(robot, "load", functools.lru_cache(robot.load.__wrapped__))
 
@@ -812,10 +812,10 @@ class TestChangedRobot:
     @pytest.mark.parametrize("old", CHANGES)
     def test_every_kind_of_change_is_named(self, edit_robot, old):
         new, said = CHANGES[old]
-        before = fingerprint.fingerprint(robot.XBOT_L)
+        before = fingerprint.fingerprint(XBOT_L)
         assert fingerprint.changes(before, before) == ""
         edit_robot(old, new)
-        found = fingerprint.changes(before, fingerprint.fingerprint(robot.XBOT_L))
+        found = fingerprint.changes(before, fingerprint.fingerprint(XBOT_L))
         assert found.startswith(said) and len(found) < 200
 
     def test_resume_and_policy_say_so(self, saved, restored, tmp_path, edit_robot):
@@ -858,13 +858,13 @@ class TestChangedRobot:
 
     def test_both_fidelities_count(self, monkeypatch):
         """Joint friction acts at high fidelity only."""
-        before = fingerprint.fingerprint(robot.XBOT_L)
-        described = description.read(robot.XBOT_L)
+        before = fingerprint.fingerprint(XBOT_L)
+        described = description.read(XBOT_L)
         rubs = ("ankle", description.Motor(friction=0.123))
         changed = dataclasses.replace(described, motors=(*described.motors, rubs))
         monkeypatch.setattr(description, "read", lambda name: changed)
         monkeypatch.setattr(robot, "load", functools.lru_cache(robot.load.__wrapped__))
-        said = fingerprint.changes(before, fingerprint.fingerprint(robot.XBOT_L))
+        said = fingerprint.changes(before, fingerprint.fingerprint(XBOT_L))
         assert said == "joint friction and damping at high fidelity"
 
 

@@ -10,7 +10,7 @@ import pytest
 from states import XBOT
 
 from kslc_jax import maths, motors, physics, randomize, robot
-from kslc_jax.config import HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.config import XBOT_L, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.robots import description
 
 ENGINES = ("mjx", "mujoco")
@@ -318,7 +318,7 @@ def test_mass_randomisation_matches_a_recompiled_model(xbot):
         ),
         GROUND,
     )
-    spec = mujoco.MjSpec.from_file(str(description.read(robot.XBOT_L).mjcf))
+    spec = mujoco.MjSpec.from_file(str(description.read(XBOT_L).mjcf))
     base = spec.body("base_link")
     base.ipos = base.ipos + np.array([0.05, 0, 0])
     base.mass += 4.0
@@ -339,7 +339,7 @@ def test_link_randomisation_matches_a_recompiled_model(xbot):
         link_mass=jnp.asarray(factor), link_com=jnp.asarray(shift), hand_mass=jnp.asarray(0.5)
     )
     fields = randomize.model_fields(xbot, changed, GROUND)
-    spec = mujoco.MjSpec.from_file(str(description.read(robot.XBOT_L).mjcf))
+    spec = mujoco.MjSpec.from_file(str(description.read(XBOT_L).mjcf))
     names = ["base_link", *(n.replace("joint", "link") for n in xbot.joint_names)]
     for name, f, s in zip(names, factor, shift, strict=True):
         body = spec.body(name)

@@ -11,7 +11,7 @@ import pytest
 from states import XBOT
 
 from kslc_jax import curriculum, networks, physics, randomize, robot
-from kslc_jax.config import ConfigError, HighFidelity, preset
+from kslc_jax.config import XBOT_L, ConfigError, HighFidelity, preset
 from kslc_jax.evaluation import disturbances, trials, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.policy import Policy
@@ -45,7 +45,7 @@ def inverse_inertia(model: mujoco.MjModel) -> np.ndarray:
 
 def test_heavier_hands_are_point_masses_at_the_hands():
     """As MuJoCo has it with two more bodies."""
-    spec = mujoco.MjSpec.from_file(str(description.read(robot.XBOT_L).mjcf))
+    spec = mujoco.MjSpec.from_file(str(description.read(XBOT_L).mjcf))
     hands = robot.load("high").mj_model
     for side in ("left", "right"):
         at = hands.geom(f"{side}_hand").pos

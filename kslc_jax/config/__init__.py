@@ -12,6 +12,7 @@ from kslc_jax.config.options import options
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
+    XBOT_L,
     CommandConfig,
     Config,
     ConfigError,
@@ -37,6 +38,7 @@ __all__ = [
     "COUNTER",
     "PRESETS",
     "SCHEMA_VERSION",
+    "XBOT_L",
     "CommandConfig",
     "Config",
     "ConfigError",

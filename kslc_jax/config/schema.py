@@ -12,6 +12,9 @@ Range = tuple[float, float]
 
 Fidelity = Literal["train", "high"]
 
+XBOT_L = "xbot_l"
+"""The robot of the paper. Presets are made for it."""
+
 
 class ConfigError(UserError):
     """A config value cannot work. The message names the field and says what is allowed."""
@@ -55,7 +58,7 @@ class PhysicsConfig:
 
     fidelity: ClassVar[Fidelity] = "train"
 
-    robot: str = "xbot_l"
+    robot: str = XBOT_L
     """Name of a shipped robot, or path of the description of another one (docs/own_robot.md)."""
     engine: Literal["auto", "mjx", "mujoco"] = "auto"
     """mjx: pure XLA, any device. mujoco: C MuJoCo on the CPU cores, called back from JAX; faster on
