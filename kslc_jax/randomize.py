@@ -46,12 +46,8 @@ def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
     )
 
 
-def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
-    """Draws the parameters of one episode. Each is uniform in its configured range.
-
-    Raises:
-      ConfigError: the trunk could become too light.
-    """
+def require_trunk(config: RandomizeConfig, robot: Robot) -> None:
+    """ConfigError if the trunk could become too light."""
     trunk = float(robot.mj_model.body_mass[robot.trunk_body_id])
     left = trunk * config.link_mass[0] + config.base_mass[0]
     if left < LIGHTEST * trunk:
@@ -59,6 +55,15 @@ def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
             f"randomize.base_mass: {config.base_mass[0]:g} kg leave {left:.1f} of the trunk's "
             f"{trunk:.1f} kg; at least {LIGHTEST:.0%} must stay"
         )
+
+
+def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
+    """Draws the parameters of one episode. Each is uniform in its configured range.
+
+    Raises:
+      ConfigError: see `require_trunk`.
+    """
+    require_trunk(config, robot)
     keys = jax.random.split(key, 11)
     joints, links = (robot.count,), (robot.count + 1,)
 

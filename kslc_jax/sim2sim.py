@@ -240,12 +240,17 @@ def main(argv: list[str] | None = None) -> int:
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, writes the numbers."""
     simulator(args.engine)  # fails now if the engine's package is missing
-    from kslc_jax.evaluation import schedules
+    from kslc_jax import physics, randomize
+    from kslc_jax.evaluation import schedules, trials
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
-    for name in args.schedule:  # an unreadable schedule fails before any trial
+    engine = trials.engine(policy, "high")
+    for condition in args.conditions:  # an impossible robot or schedule fails before any trial
+        tried = setting(args, engine, condition)
+        randomize.require_trunk(tried.randomize, physics.robot_for(engine))
+    for name in args.schedule:
         schedules.named(name, policy.config, float(policy.curriculum.v_max), args.top)
     screen = tables.console()
     # One report per simulated second: the estimate of the remaining time needs a long window.

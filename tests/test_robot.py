@@ -11,6 +11,7 @@ import pytest
 from states import MIRROR, XBOT
 
 from kslc_jax import motors, physics, randomize, robot
+from kslc_jax.robots.contacts import PAIR_MARGIN
 
 URDF = json.loads((Path(__file__).parent / "data" / "xbot_l_urdf.json").read_text())
 LEG = ("leg_roll", "leg_yaw", "leg_pitch", "knee", "ankle_pitch", "ankle_roll")
@@ -373,7 +374,7 @@ def test_parts_are_kept_apart_a_little_before_they_touch():
             if parts_that_touch(closed, fidelity):
                 first.setdefault(fidelity, roll)
     leg = 0.1455 + 0.277128  # m, from the hip to the knee
-    assert 0 < 2 * leg * (first["high"] - first["train"]) < 2 * robot.PAIR_MARGIN
+    assert 0 < 2 * leg * (first["high"] - first["train"]) < 2 * PAIR_MARGIN
 
 
 def test_stand_ins_cover_their_parts():
@@ -384,7 +385,7 @@ def test_stand_ins_cover_their_parts():
         np.testing.assert_allclose(bumper.pos, box.pos)
         radius, half_length = bumper.size[:2]
         corner = np.linalg.norm(box.size - [half_length, 0, 0])
-        assert radius < corner < radius + robot.PAIR_MARGIN
+        assert radius < corner < radius + PAIR_MARGIN
         bumper, hand = train(f"{side}_forearm_bumper"), train(f"{side}_hand")
         assert bumper.size[0] >= hand.size[0]
         assert bumper.pos[2] - bumper.size[:2].sum() <= hand.pos[2] - hand.size[2] + 1e-9

@@ -426,7 +426,9 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
 @pytest.fixture
 def blank_renderer(monkeypatch):
     """Replaces the renderer by one that gives black pictures without GL."""
-    blank = SimpleNamespace(frames=lambda qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos))
+    blank = SimpleNamespace(
+        frames=lambda robot, qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos)
+    )
     monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
     monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
 
@@ -437,7 +439,7 @@ def film_two_speeds(out: Path) -> None:
     linvel = np.zeros((150, 2, 3))
     linvel[..., 0] = 0.9, 2.1
     trace = SimpleNamespace(qpos=np.zeros((150, 2, 23)), linvel=linvel)
-    play.write_video(out, args, trace, [range(100, 150)] * 2, dt=0.01)
+    play.write_video(out, args, robot.load("high"), trace, [range(100, 150)] * 2, dt=0.01)
 
 
 def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
