@@ -1,6 +1,1 @@
-"""Models of the robots (MJCF). Imports no JAX."""
-
-from pathlib import Path
-
-XBOT_L = Path(__file__).parent / "xbot_l.xml"
-"""Model of XBot-L; NOTICE gives its source and licence."""
+"""Robots: descriptions, and the models that are derived from them. Imports no JAX."""
