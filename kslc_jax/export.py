@@ -159,7 +159,8 @@ def to_onnx(policy: Policy) -> bytes:
         seen = "seen"
     add("actor", seen, "action")
     history = floats("history", "batch", *policy.init().history.shape)
-    action = floats("action", "batch", len(contract.metadata(policy)["joint_names"]))
+    data = contract.metadata(policy)
+    action = floats("action", "batch", len(data["joint_names"]))
     model = helper.make_model(
         helper.make_graph(nodes, "policy", [history], [action], weights),
         opset_imports=[helper.make_opsetid("", _OPSET)],
@@ -167,7 +168,7 @@ def to_onnx(policy: Policy) -> bytes:
         producer_name="kslc_jax",
         producer_version=__version__,
     )
-    helper.set_model_props(model, {k: json.dumps(v) for k, v in contract.metadata(policy).items()})
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in data.items()})
     checker.check_model(model, full_check=True)
     return model.SerializeToString()
 

@@ -27,7 +27,7 @@ import tyro
 from kslc_jax import cli, evaluate, files
 from kslc_jax.config import require_seed
 from kslc_jax.evaluation import tables
-from kslc_jax.evaluation.bars import Bar, bars
+from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
@@ -57,9 +57,18 @@ class Size:
     perturbed_seconds: float
 
 
-FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, 3.0), 4, 20.0)
+FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, PERTURBED_TOP), 4, 20.0)
 QUICK = Size(
-    (0.0, 0.5, 2.0, 3.5, 4.0), 2, 15.0, (0.0, math.pi), 8, 20.0, ("push=0.5",), (3.0,), 2, 8.0
+    (0.0, 0.5, 2.0, 3.5, 4.0),
+    2,
+    15.0,
+    (0.0, math.pi),
+    8,
+    20.0,
+    ("push=0.5",),
+    (PERTURBED_TOP,),
+    2,
+    8.0,
 )
 
 
@@ -172,7 +181,7 @@ def _drake(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     setting = trials.Setting(
         trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
     )
-    speeds = [speed for speed in size.speeds if speed <= 4.0]
+    speeds = [speed for speed in size.speeds if speed <= TOP]
     return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
 
 

@@ -200,7 +200,6 @@ def draw(args: Args, policy) -> None:
     """Writes the gait strip and the video that `args` names."""
     import matplotlib.image
 
-    from kslc_jax import robot as robot_lib
     from kslc_jax.viewer import render
 
     for path in (args.gait_strip, args.video):
@@ -208,7 +207,7 @@ def draw(args: Args, policy) -> None:
     if args.video is not None and args.video.suffix.lower() in FILMS:
         film_writer()
     trace, start, dt = record(args, policy)
-    robot = robot_lib.load("high", name=policy.config.physics.robot)
+    robot = render.shown_robot(policy)
     for speed, up in zip(args.speeds, trace.alive[-1], strict=True):
         if not up:
             print(f"warning: fell at {speed:g} m/s; what is shown ends there")

@@ -125,7 +125,8 @@ def load(
     hands = [links[arm[-1]] for limb, arm in parts.limbs.items() if limb.endswith("arm")]
     box, mass = model.site("torso_box"), float(model.body_subtreemass[0])
     stand_height = float(model.numeric("stand_height").data[0])
-    xbot = load() if (name, fidelity) != (XBOT_L, "train") else None
+    xbot = load() if name != XBOT_L else None
+    at_home = _at_home(model)
     return Robot(
         mj_model=model,
         name=spec.modelname,
@@ -134,7 +135,7 @@ def load(
         kd=-model.actuator_biasprm[:, 2],
         effort_limit=model.actuator_forcerange[:, 1].copy(),
         speed_limit=model.numeric("speed_limit").data.copy(),
-        joint_inertia=_joint_inertia(model),
+        joint_inertia=_joint_inertia(model, at_home),
         joint_lower=model.jnt_range[joints, 0],
         joint_upper=model.jnt_range[joints, 1],
         default_qpos=home,
@@ -150,18 +151,23 @@ def load(
         total_mass=mass,
         stand_height=stand_height,
         sole_drop=float(model.numeric("sole_drop").data[0]),
-        feet_apart=_apart(model, "foot_pos"),
-        knees_apart=_apart(model, "knee_pos"),
+        feet_apart=_apart(at_home, "foot_pos"),
+        knees_apart=_apart(at_home, "knee_pos"),
         mass_ratio=mass / xbot.total_mass if xbot else 1.0,
         length_ratio=stand_height / xbot.stand_height if xbot else 1.0,
     )
 
 
-def _apart(model: mujoco.MjModel, sensor: str) -> float:
-    """Lateral distance [m] of the left and the right position sensor of this name, at home."""
+def _at_home(model: mujoco.MjModel) -> mujoco.MjData:
+    """The robot at rest in its home pose."""
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
     mujoco.mj_forward(model, data)
+    return data
+
+
+def _apart(data: mujoco.MjData, sensor: str) -> float:
+    """Lateral distance [m] of the left and the right position sensor of this name."""
     left, right = (data.sensor(f"{side}_{sensor}").data[1] for side in ("left", "right"))
     return float(left - right)
 
@@ -184,15 +190,12 @@ def _subtree(model: mujoco.MjModel) -> np.ndarray:
     return subtree
 
 
-def _joint_inertia(model: mujoco.MjModel) -> np.ndarray:
-    """[n] kg m^2, 1 / diag(M^-1) at the home pose without contact.
+def _joint_inertia(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
+    """[n] kg m^2, 1 / diag(M^-1) at the home pose `data`, without contact.
 
     It is the torque on one joint over its acceleration, while all other joints and the base are
     free to move.
     """
-    data = mujoco.MjData(model)
-    mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
-    mujoco.mj_forward(model, data)
     inverse = np.zeros((model.nv, model.nv))
     mujoco.mj_solveM(model, data, inverse, np.eye(model.nv))
     return 1.0 / np.diag(inverse)[6:]

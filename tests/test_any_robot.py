@@ -34,6 +34,7 @@ from kslc_jax import (
 )
 from kslc_jax.commands import Command
 from kslc_jax.evaluation import gait_metrics, trials
+from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robots.description import RobotError
 
 BIPED = str(Path(__file__).parent / "data" / "biped.toml")
@@ -250,6 +251,14 @@ def test_a_trial_at_high_fidelity_has_all_metrics_but_those_of_arms(biped, untra
     found = gait_metrics.summary(longer, 0.0, physics.robot_for(setting.physics), 0.01)
     assert {"knee_range_difference", "legs_momentum_rms", "stance_difference"} <= found.keys()
     assert not any("arm" in name or "shoulder" in name for name in found)
+
+
+def test_a_robot_without_hands_carries_nothing_in_them(biped, untrained):
+    setting = trials.Setting(
+        trials.engine(untrained, "high"), seconds=0.01, variation=Variation(hands=0.5)
+    )
+    (trace,) = trials.run(untrained, setting, np.zeros((1, 3)), chunk=0.01)
+    assert trace.mass[0, 0] == pytest.approx(biped.total_mass)
 
 
 def test_a_policy_knows_its_robot(untrained, tmp_path):

@@ -46,21 +46,33 @@ def bars(results: dict[str, Any]) -> list[Bar]:
     flight = [row for row in speeds if row["command"] == GAIT_TOP]
     rest = [row for row in speeds if row["command"] == 0.0]
     found = [
-        _at_least("nobody falls, 0 to 4 m/s", 1.0, _upright(_between(speeds, 0.0, TOP))),
-        _at_most("speed error, 0.5 to 4 m/s, share", 0.03, _each(gait, _speed_error)),
+        _at_least(f"nobody falls, 0 to {TOP:g} m/s", 1.0, _upright(_between(speeds, 0.0, TOP))),
+        _at_most(
+            f"speed error, {SLOWEST:g} to {TOP:g} m/s, share", 0.03, _each(gait, _speed_error)
+        ),
         _at_most("speed at command 0 [m/s]", 0.03, _each(rest, _creep)),
         _at_most("strides a second at command 0", 0.05, _of(rest, "stride_frequency")),
         _at_least("nobody falls, random schedule", 1.0, _by_condition(results["schedules"])),
-        _at_least("joints within speed limits, to 3.5 m/s", 0.99, _of(calm, "within_speed_limits")),
+        _at_least(
+            f"joints within speed limits, to {GAIT_TOP:g} m/s",
+            0.99,
+            _of(calm, "within_speed_limits"),
+        ),
         _at_most("arm-leg correlation", -0.5, _of(gait, "shoulder_hip_correlation")),
         _at_most("left-right difference", 0.05, _each(gait, _asymmetry)),
-        _at_most("lateral std, to 3.5 m/s [m/s]", 0.1, _of(calm, "lateral_std")),
-        _at_most("yaw-rate std, to 3.5 m/s [rad/s]", 0.25, _of(calm, "yaw_rate_std")),
-        _at_least("flight at 3.5 m/s", 0.1, _of(flight, "flight_share")),
-        _at_least("nobody falls, perturbed, to 3 m/s", 1.0, _by_condition(results["perturbed"])),
+        _at_most(f"lateral std, to {GAIT_TOP:g} m/s [m/s]", 0.1, _of(calm, "lateral_std")),
+        _at_most(f"yaw-rate std, to {GAIT_TOP:g} m/s [rad/s]", 0.25, _of(calm, "yaw_rate_std")),
+        _at_least(f"flight at {GAIT_TOP:g} m/s", 0.1, _of(flight, "flight_share")),
+        _at_least(
+            f"nobody falls, perturbed, to {PERTURBED_TOP:g} m/s",
+            1.0,
+            _by_condition(results["perturbed"]),
+        ),
     ]
     if "drake" in results:
-        found.append(_at_least("nobody falls, Drake, to 4 m/s", 1.0, _upright(results["drake"])))
+        found.append(
+            _at_least(f"nobody falls, Drake, to {TOP:g} m/s", 1.0, _upright(results["drake"]))
+        )
     return found
 
 

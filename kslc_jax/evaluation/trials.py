@@ -274,7 +274,7 @@ def _advance(
         steps=trial.steps + 1,
     )
     mass = randomize.total_mass(robot, after.dynamics)
-    mass += len(variation.FEET) * setting.variation.hands
+    mass += len(robot.hand_body_ids) * setting.variation.hands
     return trial, _record(robot, trial, state.command.velocity, mass)
 
 

@@ -20,13 +20,12 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from kslc_jax import policy as policy_lib
-from kslc_jax import robot as robot_lib
 from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.evaluation import trials
 from kslc_jax.policy import Policy, load_policy
 from kslc_jax.robot import Robot
-from kslc_jax.viewer import panel
+from kslc_jax.viewer import panel, render
 from kslc_jax.viewer.following import Follower
 from kslc_jax.viewer.session import Pacer, Session, View
 
@@ -187,11 +186,6 @@ def serve(host: str, port: int) -> viser.ViserServer:
         return viser.ViserServer(host, port, verbose=False)
 
 
-def shown_robot(policy: Policy) -> Robot:
-    """The policy's robot at high fidelity; the training model has shapes that should be hidden."""
-    return robot_lib.load("high", name=policy.config.physics.robot)
-
-
 class Viewer:
     """Shows one robot to every browser that opens the page."""
 
@@ -217,15 +211,15 @@ class Viewer:
         self._given = self._name = next(iter(self._policies))
         loaded = load_policy(folder)
         self.server = serve(host, port)
-        self.figure = Figure(self.server, shown_robot(loaded))
+        self.figure = Figure(self.server, render.shown_robot(loaded))
         self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
         self._rng = np.random.default_rng(seed)
         self._play(loaded)
 
     def _play(self, policy: Policy) -> None:
         """Starts a new session with the policy, and draws its robot."""
-        if self.figure.robot is not shown_robot(policy):
-            self.figure.draw(shown_robot(policy))
+        if self.figure.robot is not render.shown_robot(policy):
+            self.figure.draw(render.shown_robot(policy))
         self.session = Session(policy, trials.engine(policy, self._fidelity), self._seed)
         self.session.advance(np.zeros(3))  # compiles
         self.panel.allow(float(policy.curriculum.v_max))

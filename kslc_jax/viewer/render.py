@@ -6,13 +6,18 @@ Call `runtime.prepare()` before you import anything that imports mujoco: it choo
 import contextlib
 import os
 from collections.abc import Generator, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
+from kslc_jax import robot as robot_lib
 from kslc_jax.errors import MissingPackage
 from kslc_jax.robot import Robot
 from kslc_jax.runtime import first_line
+
+if TYPE_CHECKING:
+    from kslc_jax.policy import Policy
 
 LONG_LENS = 10.0
 """Vertical field of view of gait strips [degrees]."""
@@ -43,6 +48,11 @@ def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mu
             f"MUJOCO_GL={chosen} does not work here ({first_line(error)}); "
             "try the other of egl and osmesa"
         ) from error
+
+
+def shown_robot(policy: "Policy") -> Robot:
+    """The policy's robot at high fidelity; the training model has shapes that should be hidden."""
+    return robot_lib.load("high", name=policy.config.physics.robot)
 
 
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
