@@ -27,6 +27,7 @@ from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config
 from kslc_jax.errors import UserError
 from kslc_jax.fingerprint import Fingerprint, changes, fingerprint
+from kslc_jax.robots import copying
 
 SCHEMA_VERSION = 3
 """Version of a checkpoint's items. Raise it when you change the tree of `TrainState`, and note
@@ -37,6 +38,8 @@ OLDER_POLICIES = (1, 2)
 lacks the average of the actor, the time of the next command, and the curriculum's sums of commands
 at the top."""
 
+COMMITTED = "Checkpoint commit was successful\n"
+"""Content of the files `commit_success.txt`."""
 
 ROBOT_NUMBERS = "robot_numbers"
 """Entry of a meta item: the `fingerprint` of the robot. Older checkpoints lack it."""
@@ -69,12 +72,13 @@ def checksum(tree: Any) -> int:
     return crc
 
 
-def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
+def checked_metadata(meta: Any, whole: bool, folder: Path) -> dict[str, Any]:
     """Checks a meta item and returns it.
 
     Args:
       meta: the item.
       whole: True to resume the training, False to read the policy alone.
+      folder: of the checkpoint or the policy.
 
     Raises:
       CheckpointError: the item is damaged, of another robot, or of a schema that cannot be read.
@@ -91,28 +95,46 @@ def checked_metadata(meta: Any, whole: bool) -> dict[str, Any]:
             "use the version that wrote it, see versions.json"
         )
     require_checksum(meta.get("checksums", {}), "meta", zlib.crc32(_text(meta)))
-    ours = _robot(_robot_name(meta))
+    ours = identity(_robot_name(meta, folder))
     theirs = meta.get("robot", ours)  # the first schema lacks this entry
     if theirs != ours:
         raise CheckpointError(f"it is of another robot, {theirs!r:.80}, not of {ours['name']}")
     return meta
 
 
-def changed_robot(meta: dict[str, Any]) -> str:
+def changed_robot(meta: dict[str, Any], folder: Path) -> str:
     """The changes of a meta item's robot since the save, in one line.
 
     The text is empty if nothing changed, or if the item stores no numbers of the robot.
     """
     numbers = meta.get(ROBOT_NUMBERS)
-    return changes(numbers, fingerprint(_robot_name(meta))) if numbers else ""
+    return changes(numbers, fingerprint(_robot_name(meta, folder))) if numbers else ""
 
 
-def _robot_name(meta: dict[str, Any]) -> str:
-    """`physics.robot` of the stored config. Configs without the field are of XBot-L."""
-    return meta["config"].get("physics", {}).get("robot", config_lib.XBOT_L)
+def _robot_name(meta: dict[str, Any], folder: Path) -> str:
+    """The robot of the stored config. Configs without the field `physics.robot` are of XBot-L."""
+    stored = meta["config"].get("physics", {}).get("robot", config_lib.XBOT_L)
+    return config_lib.find_robot(stored, owner(folder))
 
 
-def _robot(name: str) -> dict[str, Any]:
+def owner(folder: Path) -> Path:
+    """The run folder of a checkpoint or a snapshot; the folder itself for any other policy."""
+    in_run = folder.parent.name in (files.CHECKPOINTS, files.SNAPSHOTS)
+    return folder.parents[1] if in_run else folder
+
+
+def keep_robot(config: Config, folder: Path, anew: bool = False) -> None:
+    """Copies a user's robot into a run folder or the folder of a policy.
+
+    A copy that is there stays, unless `anew`.
+    """
+    robot = config.physics.robot
+    there = (folder / files.ROBOT / Path(robot).name).is_file()
+    if config_lib.is_description(robot) and (anew or not there):
+        copying.copy(robot, folder / files.ROBOT)
+
+
+def identity(name: str) -> dict[str, Any]:
     """The robot's name and its joint order, which defines the components of an action."""
     robot = robot_lib.load(name=name)
     return {"name": robot.name, "joints": list(robot.joint_names)}
@@ -134,7 +156,7 @@ def metadata(
     """
     meta = {
         "schema": SCHEMA_VERSION,
-        "robot": _robot(config.physics.robot),
+        "robot": identity(config.physics.robot),
         "config": config_lib.to_dict(config),
         "metrics": metrics,
     }
@@ -173,6 +195,16 @@ def clear_away(folder: Path) -> None:
         for path in folder.glob("*.orbax-checkpoint-tmp*"):
             shutil.rmtree(path, ignore_errors=True)
         time.sleep(0.1)
+
+
+def forget_where(folder: Path) -> None:
+    """Removes the absolute path from the files `commit_success.txt` that orbax writes.
+
+    Orbax only checks that they exist. People pass policies on, and the path is private.
+    """
+    for note in folder.rglob("commit_success.txt"):
+        if note.read_text() != COMMITTED:
+            note.write_text(COMMITTED)
 
 
 def has_checkpoints(run_dir: Path) -> bool:

@@ -8,12 +8,15 @@ import os
 from pathlib import Path
 from typing import Any
 
-from kslc_jax.config import ConfigError
+from kslc_jax.config import ROBOT_FOLDER, ConfigError
 
 # ------------------------------------------------------------------- names within a run folder
 
 CONFIG = "config.json"
 """The training's config."""
+
+ROBOT = ROBOT_FOLDER
+"""Folder with the copy of a user's robot; a policy that was exported has one, too."""
 
 VERSIONS = "versions.json"
 """Versions of the packages, the machine, and the policy that the training started from."""

@@ -22,7 +22,10 @@ from kslc_jax.checkpoint_format import (
     checked_metadata,
     checksum,
     clear_away,
+    forget_where,
+    keep_robot,
     metadata,
+    owner,
     require_checksum,
     whole_checkpoints,
 )
@@ -79,8 +82,8 @@ def load_policy(path_or_name: str | Path) -> Policy:
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as reader:
         try:
             meta = reader.restore(folder, args=ocp.args.Composite(meta=ocp.args.JsonRestore()))
-            meta = checked_metadata(meta["meta"], whole=False)
-            config = config_lib.from_dict(meta["config"])
+            meta = checked_metadata(meta["meta"], False, folder)
+            config = config_lib.from_dict(meta["config"], owner(folder))
             reached = meta["metrics"]
             step = int(reached.get("step", folder.name if folder.name.isdigit() else 0))
             curriculum = curriculum_lib.init(config).replace(
@@ -92,7 +95,7 @@ def load_policy(path_or_name: str | Path) -> Policy:
             params = reader.restore(folder, args=args)["params"]
             require_checksum(meta.get("checksums", {}), "params", checksum(params))
             trained = meta.get(ROBOT_NUMBERS)
-            changed = changed_robot(meta)
+            changed = changed_robot(meta, folder)
         except Exception as error:  # damaged metadata can lead orbax anywhere
             raise CheckpointError(
                 f"{folder} is no readable checkpoint: {first_line(error)}"
@@ -108,7 +111,10 @@ def load_policy(path_or_name: str | Path) -> Policy:
 
 
 def save_policy(policy: Policy, folder: Path) -> None:
-    """Writes the items that `load_policy` reads; CheckpointError if that fails."""
+    """Writes the items that `load_policy` reads; CheckpointError if that fails.
+
+    A user's robot is copied into the folder, except in a run folder, which has a copy.
+    """
     reached = policy.curriculum
     metrics = {
         "step": policy.step,
@@ -120,19 +126,11 @@ def save_policy(policy: Policy, folder: Path) -> None:
     with ocp.Checkpointer(ocp.CompositeCheckpointHandler()) as writer:
         try:
             writer.save(folder.resolve(), args=ocp.args.Composite(**items))
-            _forget_where(folder)
+            forget_where(folder)
+            keep_robot(policy.config, owner(folder.absolute()))
         except (OSError, ValueError) as error:
             clear_away(folder.parent)
             raise CheckpointError(f"cannot write {folder}: {first_line(error)}") from error
-
-
-def _forget_where(folder: Path) -> None:
-    """Removes the absolute path from the files `commit_success.txt` that orbax writes.
-
-    Orbax only checks that they exist. People pass policies on, and the path is private.
-    """
-    for note in folder.rglob("commit_success.txt"):
-        note.write_text("Checkpoint commit was successful\n")
 
 
 def policy_name(path_or_name: str | Path) -> str:

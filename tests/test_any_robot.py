@@ -1,6 +1,7 @@
 """The package with another robot: the biped of tests/data, without arms and with other names."""
 
 import dataclasses
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -35,7 +36,9 @@ from kslc_jax import (
 from kslc_jax.commands import Command
 from kslc_jax.evaluation import gait_metrics, trials
 from kslc_jax.evaluation.perturbations import Variation
+from kslc_jax.robots import copying, description
 from kslc_jax.robots.description import RobotError
+from kslc_jax.training import run_folder
 
 BIPED = str(Path(__file__).parent / "data" / "biped.toml")
 ENVS = 3
@@ -264,7 +267,7 @@ def test_a_robot_without_hands_carries_nothing_in_them(biped, untrained):
 def test_a_policy_knows_its_robot(untrained, tmp_path):
     policy.save_policy(untrained, tmp_path / "policy")
     loaded = policy.load_policy(tmp_path / "policy")
-    assert loaded.config.physics.robot == BIPED
+    assert loaded.config.physics.robot == str(tmp_path / "policy" / "robot" / "biped.toml")
     history = jnp.ones(untrained.init().history.shape)
     np.testing.assert_array_equal(loaded.act_on(history), untrained.act_on(history))
     ours = checkpoint_format.metadata(untrained.config, {}, {})
@@ -272,7 +275,70 @@ def test_a_policy_knows_its_robot(untrained, tmp_path):
     ours["robot"] = theirs["robot"]
     del ours["checksums"]
     with pytest.raises(checkpoint_format.CheckpointError, match=r"another robot.*not of biped"):
-        checkpoint_format.checked_metadata(ours, whole=False)
+        checkpoint_format.checked_metadata(ours, False, tmp_path / "policy")
+
+
+@pytest.fixture
+def mine(setup, tmp_path):
+    """(config of a robot in a user's folder, that folder). Its MJCF lies elsewhere and has an
+    include."""
+    home = tmp_path / "mine"
+    for name in ("about", "models/parts"):
+        (home / name).mkdir(parents=True)
+    source = Path(BIPED).with_suffix(".xml").read_text()
+    include = '<include file="parts/nothing.xml"/></mujoco>'
+    (home / "models" / "biped.xml").write_text(source.replace("</mujoco>", include))
+    (home / "models" / "parts" / "nothing.xml").write_text("<mujoco><visual/></mujoco>")
+    described = Path(BIPED).read_text().replace('"biped.xml"', '"../models/biped.xml" # mine')
+    (home / "about" / "biped.toml").write_text(described)
+    engine = dataclasses.replace(setup.physics, robot=str(home / "about" / "biped.toml"))
+    return dataclasses.replace(setup, physics=engine), home
+
+
+def test_a_policy_takes_its_robot_along(mine, untrained, tmp_path):
+    """It loads on another machine, and none of its files names a folder of this one."""
+    setup, home = mine
+    policy.save_policy(dataclasses.replace(untrained, config=setup), tmp_path / "here")
+    shutil.rmtree(home)
+    (tmp_path / "here").rename(tmp_path / "there")
+    loaded = policy.load_policy(tmp_path / "there")
+    robot_file = tmp_path / "there" / "robot" / "biped.toml"
+    assert loaded.config.physics.robot == str(robot_file)
+    assert 'mjcf = "mjcf/biped.xml"' in robot_file.read_text()
+    history = jnp.ones(untrained.init().history.shape)
+    np.testing.assert_array_equal(loaded.act_on(history), untrained.act_on(history))
+    stored = [path for path in (tmp_path / "there").rglob("*") if path.is_file()]
+    assert len(stored) > 5 and not [p for p in stored if bytes(tmp_path) in p.read_bytes()]
+    policy.save_policy(loaded, tmp_path / "again")
+    assert policy.load_policy(tmp_path / "again").config != loaded.config  # its own copy
+
+
+def test_a_training_keeps_its_robot(mine, tmp_path):
+    """The run folder has a copy. Asked for by its description, the robot must have its numbers."""
+    setup, home = mine
+    run, about = tmp_path / "runs" / "x", home / "about" / "biped.toml"
+    run.mkdir(parents=True)
+    run_folder.open_folder(run, setup, False, {})
+    kept = run_folder.read_config(run)
+    assert kept.physics.robot == str(run / "robot" / "biped.toml")
+    assert str(tmp_path) not in (run / "config.json").read_text()
+    run_folder.difference(kept, setup)
+    run_folder.open_folder(run, kept, True, {})
+    stronger = home / "stronger" / "biped.toml"  # in another place: descriptions are cached
+    stronger.parent.mkdir()
+    stronger.write_text(about.read_text().replace("kp = 60", "kp = 66"))
+    engine = dataclasses.replace(setup.physics, robot=str(stronger))
+    with pytest.raises(config.ConfigError, match=r"biped.toml has changed since .* 60 -> 66"):
+        run_folder.difference(kept, dataclasses.replace(setup, physics=engine))
+
+
+def test_the_copy_of_a_robot_in_a_package_is_its_description(tmp_path):
+    try:
+        about = description.read("unitree_g1").path
+    except RobotError as error:
+        pytest.skip(str(error))
+    copying.copy(str(about), tmp_path / "robot")
+    assert [p.name for p in (tmp_path / "robot").iterdir()] == ["unitree_g1.toml"]
 
 
 def test_the_exported_model_is_the_robots(biped, untrained):
@@ -309,7 +375,10 @@ def test_a_training_does_not_start_from_another_robots_policy(tmp_path, capsys):
     given = ["--start-from", "xbot_l_run", "--run-dir", str(tmp_path)]
     assert train.main(["--robot", BIPED, "--preset", "debug", *given]) == 2
     said = capsys.readouterr().err.strip()
-    assert said.endswith(f"it is of the robot xbot_l, not of {BIPED}") and "\n" not in said
+    assert (
+        said.endswith("of the robot XBot-L, not of biped, or its joints have another order")
+        and "\n" not in said
+    )
 
 
 @pytest.mark.slow(reason="compiles a train step: a minute")

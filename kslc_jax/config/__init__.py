@@ -31,12 +31,20 @@ from kslc_jax.config.schema import (
     RunConfig,
     require_seed,
 )
-from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
+from kslc_jax.config.storage import (
+    ROBOT_FOLDER,
+    SCHEMA_VERSION,
+    find_robot,
+    from_dict,
+    is_description,
+    to_dict,
+)
 
 __all__ = [
     "ABLATIONS",
     "COUNTER",
     "PRESETS",
+    "ROBOT_FOLDER",
     "SCHEMA_VERSION",
     "XBOT_L",
     "CommandConfig",
@@ -55,7 +63,9 @@ __all__ = [
     "RewardConfig",
     "RewardWeights",
     "RunConfig",
+    "find_robot",
     "from_dict",
+    "is_description",
     "options",
     "preset",
     "require_seed",

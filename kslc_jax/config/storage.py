@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import typing
+from pathlib import Path
 from typing import Any, Literal
 
 from kslc_jax.config.schema import Config, require
@@ -13,15 +14,43 @@ REMOVED_FIELDS = {"config.physics.clamp_joint_speed"}
 """Fields of older files that the reader ignores."""
 
 
+ROBOT_FOLDER = "robot"
+"""Folder with the copy of a user's robot, in a run folder or in the folder of a policy."""
+
+
 def to_dict(config: Config) -> dict[str, Any]:
-    """Plain nested dict for JSON, with the schema version."""
-    return {"schema": SCHEMA_VERSION, **dataclasses.asdict(config)}
+    """Plain nested dict for JSON, with the schema version.
+
+    The path of a robot's description becomes that of its copy, relative to the run folder: files on
+    disk name no folder of this machine.
+    """
+    data = dataclasses.asdict(config)
+    if is_description(robot := config.physics.robot):
+        data["physics"]["robot"] = f"{ROBOT_FOLDER}/{Path(robot).name}"
+    return {"schema": SCHEMA_VERSION, **data}
 
 
-def from_dict(data: dict[str, Any]) -> Config:
+def is_description(robot: str) -> bool:
+    """True if `physics.robot` is the path of a description, False if it is a shipped robot."""
+    return robot.endswith(".toml")
+
+
+def find_robot(robot: str, folder: Path) -> str:
+    """The path of the robot's copy in `folder`; `robot` itself if there is none.
+
+    Args:
+      robot: `physics.robot` of a stored config.
+      folder: run folder, or folder of a policy.
+    """
+    copy = folder.absolute() / ROBOT_FOLDER / Path(robot).name
+    return str(copy) if is_description(robot) and copy.is_file() else robot
+
+
+def from_dict(data: dict[str, Any], folder: Path | None = None) -> Config:
     """Inverse of `to_dict`. ConfigError names an unknown field or a wrong value.
 
     A missing field gets its default. So the default of a new field must keep the old behaviour.
+    `find_robot` looks for the robot in `folder`, the run folder or the folder of the policy.
     """
     require(isinstance(data, dict), "config: not a JSON object")
     data = dict(data)
@@ -30,7 +59,11 @@ def from_dict(data: dict[str, Any]) -> Config:
         schema == SCHEMA_VERSION,
         f"config: schema version {schema}, this kslc_jax reads version {SCHEMA_VERSION}",
     )
-    return _build(Config, data, "config")
+    config = _build(Config, data, "config")
+    if folder is None:
+        return config
+    robot = find_robot(config.physics.robot, folder)
+    return dataclasses.replace(config, physics=dataclasses.replace(config.physics, robot=robot))
 
 
 def _build(cls: Any, data: Any, where: str) -> Any:

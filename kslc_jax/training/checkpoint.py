@@ -16,6 +16,7 @@ from kslc_jax.checkpoint_format import (
     checked_metadata,
     checksum,
     clear_away,
+    forget_where,
     metadata,
     require_checksum,
 )
@@ -98,6 +99,7 @@ class Store:
         """Blocks until the last save is on disk; CheckpointError if it failed."""
         with self._writing():
             self._manager.wait_until_finished()
+            forget_where(self.folder)
 
     @contextlib.contextmanager
     def _writing(self) -> Generator[None]:
@@ -165,12 +167,13 @@ class Store:
         parts = _split(like)
         items = {name: ocp.args.StandardRestore(abstract(part)) for name, part in parts.items()}
         only_meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
-        meta = checked_metadata(self._manager.restore(step, args=only_meta)["meta"], whole=True)
+        folder = self.folder / str(step)
+        meta = checked_metadata(self._manager.restore(step, args=only_meta)["meta"], True, folder)
         restored = self._manager.restore(step, args=ocp.args.Composite(**items))
         sums = meta.get("checksums", {})
         for name in items:
             require_checksum(sums, name, checksum(restored[name]))
-        changed = changed_robot(meta)
+        changed = changed_robot(meta, folder)
         return _join({name: restored[name] for name in items}, like), changed
 
     def close(self) -> None:

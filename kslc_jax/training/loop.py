@@ -21,6 +21,7 @@ import jax
 from jax.sharding import Mesh
 
 from kslc_jax import files, physics, train_step
+from kslc_jax.checkpoint_format import identity
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.networks import Params
@@ -156,11 +157,12 @@ def _starting_from(
     def chosen() -> tuple[Params, Curriculum]:
         nonlocal step
         policy = storage.load_policy(path)
-        step, theirs = policy.step, policy.config.physics.robot
-        if theirs != config.physics.robot:
+        step = policy.step
+        theirs, ours = (identity(c.physics.robot) for c in (policy.config, config))
+        if theirs != ours:
             raise ConfigError(
-                f"cannot start from {path}: it is of the robot {theirs}, not of "
-                f"{config.physics.robot}"
+                f"cannot start from {path}: it is of the robot {theirs['name']}, not of "
+                f"{ours['name']}, or its joints have another order"
             )
         try:
             jax.eval_shape(start, like, policy.params, policy.curriculum)

@@ -170,7 +170,7 @@ def read_dump(path: Path) -> tuple[Config, TrainState]:
 
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            config = config_lib.from_dict(json.loads(str(arrays["config"])))
+            config = config_lib.from_dict(json.loads(str(arrays["config"])), path.parent)
             like = jax.eval_shape(lambda: train_step.init(config, 0))
             return config, jax.tree.map_with_path(leaf, like)
     except Exception as error:  # a wrong file can fail as zip, as JSON, or as config

@@ -18,9 +18,15 @@ import jax
 
 from kslc_jax import __version__, files, networks, physics
 from kslc_jax import config as config_lib
-from kslc_jax.checkpoint_format import has_checkpoints, whole_checkpoints
+from kslc_jax.checkpoint_format import (
+    has_checkpoints,
+    identity,
+    keep_robot,
+    whole_checkpoints,
+)
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
+from kslc_jax.fingerprint import changes, fingerprint
 from kslc_jax.runtime import first_line
 from kslc_jax.training.logs import rows_written
 
@@ -130,6 +136,7 @@ def open_folder(run_dir: Path, config: Config, resume: bool, facts: dict[str, An
         )
     done = last_step(run_dir)
     with writing(run_dir):
+        keep_robot(config, run_dir, anew=not resume)
         if not resume:
             _write(run_dir / files.VERSIONS, facts)
         elif done < config.num_updates and (news := _news(run_dir, facts)):
@@ -180,8 +187,8 @@ def _news(run_dir: Path, facts: dict[str, Any]) -> dict[str, Any]:
 def _last_known(run_dir: Path) -> dict[str, Any]:
     """The circumstances under which the training last ran."""
     known = _stored_versions(run_dir)
-    for changes in known.pop(RESUMED, []):
-        known |= changes
+    for later in known.pop(RESUMED, []):
+        known |= later
     return known
 
 
@@ -210,7 +217,7 @@ def read_config(run_dir: Path) -> Config:
     """The config in a run folder; RunError if it cannot be read, ConfigError if it is damaged."""
     path = run_dir / files.CONFIG
     try:
-        return config_lib.from_dict(json.loads(path.read_text()))
+        return config_lib.from_dict(json.loads(path.read_text()), run_dir)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise RunError(f"{run_dir} holds no training to resume (no {files.CONFIG})") from error
     except OSError as error:
@@ -226,12 +233,26 @@ def difference(stored: Config, wanted: Config) -> None:
         if dataclasses.is_dataclass(a):
             for f in dataclasses.fields(a):
                 walk(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}".lstrip("."))
-        elif a != b:
+        elif a != b and not (where == "physics.robot" and _same_robot(str(a), str(b))):
             raise ConfigError(f"{where} is {a} in the run that is there, not {b}")
 
     for f in dataclasses.fields(stored):
         if f.name != "run":
             walk(getattr(stored, f.name), getattr(wanted, f.name), f.name)
+
+
+def _same_robot(stored: str, wanted: str) -> bool:
+    """True if the run's copy of a robot has the numbers of the description that is asked for.
+
+    ConfigError names the numbers that have changed since the copy was made.
+    """
+    if not all(map(config_lib.is_description, (stored, wanted))):
+        return False
+    if identity(stored) != identity(wanted):
+        return False
+    if changed := changes(fingerprint(stored), fingerprint(wanted)):
+        raise ConfigError(f"{wanted} has changed since the run began: {changed}")
+    return True
 
 
 def _require_same(run_dir: Path, wanted: Config) -> None:
