@@ -9,6 +9,7 @@ import math
 import zlib
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from kslc_jax import robot as robot_lib
@@ -39,8 +40,24 @@ _FIELDS = {
         *("sensor_type", "sensor_objtype", "sensor_objid", "sensor_adr", "sensor_cutoff"),
         *("site_bodyid", "site_pos", "site_quat"),
     ),
+    "sizes of sites": ("site_size",),
+    "springs and reference angles": ("qpos0", "qpos_spring", "jnt_stiffnesspoly"),
+    "nonlinear damping": ("dof_dampingpoly",),
+    "softness of joints": (
+        *("dof_solref", "dof_solimp", "jnt_solref", "jnt_solimp", "jnt_margin", "jnt_limited"),
+    ),
+    "actuators": ("actuator_gear", "actuator_dyntype", "actuator_gaintype", "actuator_biastype"),
+    "equalities and tendons": (
+        *("eq_type", "eq_obj1id", "eq_obj2id", "eq_data", "eq_solref", "eq_solimp", "eq_active0"),
+        *("tendon_range", "tendon_stiffness", "tendon_damping", "tendon_frictionloss"),
+        *("tendon_lengthspring", "tendon_solref_lim", "tendon_solimp_lim", "wrap_objid"),
+        *("wrap_prm",),
+    ),
+    "gravity compensation": ("body_gravcomp",),
+    "adhesion": ("geom_adhesion", "pair_adhesion"),
 }
-"""Groups of the compiled model's arrays."""
+"""Groups of the compiled model's arrays. An older MuJoCo may lack an array. Do not change a group:
+add another one, because checkpoints store the checksums."""
 
 _COLLISION = (
     *("bodyid", "type", "size", "pos", "quat", "friction", "condim", "contype", "conaffinity"),
@@ -50,6 +67,9 @@ _COLLISION = (
 
 _OPTIONS = ("gravity", "integrator", "cone", "solver", "impratio", "tolerance", "disableflags")
 """Options of the simulation that `PhysicsConfig` does not contain."""
+
+_MORE_OPTIONS = ("wind", "density", "viscosity", "ls_tolerance", "enableflags", "ccd_tolerance")
+"""Further options. Older checkpoints do not have this group."""
 
 
 def fingerprint(name: str) -> Fingerprint:
@@ -125,10 +145,24 @@ def _digests(robot: Robot) -> dict[str, str]:
     model = robot.mj_model
     touching = (model.geom_contype | model.geom_conaffinity) > 0
     touching[np.union1d(model.pair_geom1, model.pair_geom2).astype(int)] = True
-    groups = {group: [getattr(model, f) for f in fields] for group, fields in _FIELDS.items()}
+    none = np.zeros(0)
+    groups = {group: [getattr(model, f, none) for f in fields] for group, fields in _FIELDS.items()}
     groups["shapes"] = [getattr(model, f"geom_{name}")[touching] for name in _COLLISION]
+    groups["meshes"] = [_vertices(model, geom) for geom in np.flatnonzero(touching)]
     groups["solver"] = [np.asarray(getattr(model.opt, name)) for name in _OPTIONS]
+    groups["further options"] = [np.asarray(getattr(model.opt, name)) for name in _MORE_OPTIONS]
+    heights = [robot.stand_height, robot.sole_drop, *robot.default_qpos[:7]]
+    groups["measures"] = [np.array(heights), robot.hand_points]
     return {group: _digest(arrays) for group, arrays in groups.items()}
+
+
+def _vertices(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """[k, 3] vertices of a geom's mesh; empty for other shapes."""
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+        return np.zeros((0, 3))
+    mesh = model.geom_dataid[geom]
+    start = model.mesh_vertadr[mesh]
+    return model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
 
 
 def _digest(arrays: list[np.ndarray]) -> str:

@@ -159,6 +159,11 @@ def parse(argv: list[str]) -> Args:
     if args.profile < 0:
         raise ConfigError(f"--profile: {args.profile} train steps; 0 writes no trace")
     config = args.config
+    if config.physics.robot != base.physics.robot:
+        raise ConfigError(
+            f"--physics.robot would keep numbers that are made for {base.physics.robot}: use "
+            f"--robot {config.physics.robot}, which scales the preset to the robot"
+        )
     if args.steps is not None:
         config = dataclasses.replace(config, run=dataclasses.replace(config.run, steps=args.steps))
     return dataclasses.replace(args, config=config)

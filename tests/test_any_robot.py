@@ -381,6 +381,17 @@ def test_a_training_does_not_start_from_another_robots_policy(tmp_path, capsys):
     )
 
 
+def test_a_robot_is_chosen_by_its_own_option(capsys):
+    """The field of the config alone would leave the numbers of another robot."""
+    assert train.main(["--preset", "debug", "--physics.robot", BIPED]) == 2
+    assert f"use --robot {BIPED}, which scales" in capsys.readouterr().err
+    wanted = dataclasses.replace(similar.preset("debug", BIPED), seed=4)
+    presets = {name: similar.preset(name, BIPED) for name in config.PRESETS}
+    words = config.options(wanted, presets)
+    assert words == ["--robot", BIPED, "--preset", "debug", "--seed", "4"]
+    assert train.parse(words).config == wanted
+
+
 @pytest.mark.slow(reason="compiles a train step: a minute")
 def test_the_biped_trains_and_resumes(tmp_path):
     run = ["--run-dir", str(tmp_path), "--steps"]

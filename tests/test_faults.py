@@ -3,6 +3,7 @@
 import ast
 import asyncio
 import contextlib
+import copy
 import dataclasses
 import functools
 import json
@@ -22,6 +23,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from processes import METRICS
@@ -799,6 +801,19 @@ CHANGES = {
 """A text of the MJCF, what takes its place, and what is said of it."""
 
 
+def swung(model):
+    """[steps, ...] positions and sensors of a robot whose joints follow a sine for 0.4 s."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
+    data.qvel[:] = 0.0  # a reset of an episode sets its own
+    target, rows = data.qpos[7:].copy(), []
+    for step in range(round(0.4 / model.opt.timestep)):
+        data.ctrl[:] = target + 0.3 * np.sin(0.04 * step)
+        mujoco.mj_step(model, data)
+        rows.append(np.concatenate([data.qpos, data.sensordata]))
+    return np.array(rows)
+
+
 class TestChangedRobot:
     """A training or a policy of a robot that has other numbers now."""
 
@@ -817,6 +832,26 @@ class TestChangedRobot:
         edit_robot(old, new)
         found = fingerprint.changes(before, fingerprint.fingerprint(XBOT_L))
         assert found.startswith(said) and len(found) < 200
+
+    @pytest.mark.parametrize("fidelity", fingerprint.FIDELITIES)
+    def test_every_number_that_moves_the_robot_counts(self, fidelity):
+        """A change of any array of the model that changes a simulation changes the fingerprint."""
+        biped = robot.load(fidelity, name=str(Path(__file__).parent / "data" / "biped.toml"))
+        before, path = fingerprint._digests(biped), swung(biped.mj_model)
+        silent = set()
+        for name in dir(biped.mj_model):
+            numbers = getattr(biped.mj_model, name)
+            if not (isinstance(numbers, np.ndarray) and numbers.size and numbers.dtype.kind == "f"):
+                continue
+            model = copy.copy(biped.mj_model)
+            getattr(model, name)[...] = 1.1 * numbers + 0.003
+            if not np.array_equal(path, swung(model), equal_nan=True):
+                now = fingerprint._digests(dataclasses.replace(biped, mj_model=model))
+                silent |= {name} if now == before else set()
+        values = {"actuator_gainprm", "actuator_biasprm", "jnt_range", "dof_armature", "body_mass"}
+        values.add("key_qpos")
+        derived = {"body_invweight0", "dof_invweight0", "body_subtreemass", "geom_rbound"}
+        assert "body_mass" in silent and silent <= values | derived
 
     def test_resume_and_policy_say_so(self, saved, restored, tmp_path, edit_robot):
         saved(tmp_path, 1)

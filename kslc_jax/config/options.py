@@ -1,17 +1,23 @@
 """A config as command-line options of `python -m kslc_jax.train`."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 from kslc_jax.config.presets import PRESETS
-from kslc_jax.config.schema import Config
+from kslc_jax.config.schema import XBOT_L, Config
 
 
-def options(config: Config) -> list[str]:
-    """The options of `train` that give `config`: the nearest preset and what differs from it."""
-    changes = {name: _changes(preset, config) for name, preset in PRESETS.items()}
+def options(config: Config, presets: Mapping[str, Config] = PRESETS) -> list[str]:
+    """The options of `train` that give `config`: the nearest preset and what differs from it.
+
+    `presets` are those of the config's robot.
+    """
+    robot = config.physics.robot
+    changes = {name: _changes(preset, config) for name, preset in presets.items()}
     nearest = min(changes, key=lambda name: len(changes[name]))
-    return ["--preset", nearest, *(word for option in changes[nearest] for word in option)]
+    of = [] if robot == XBOT_L else ["--robot", robot]
+    return [*of, "--preset", nearest, *(word for option in changes[nearest] for word in option)]
 
 
 def _changes(base: Any, wanted: Any, where: str = "") -> list[list[str]]:

@@ -11,6 +11,7 @@ import functools
 import os
 import shlex
 import time
+import warnings
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -20,10 +21,12 @@ from typing import Any
 import jax
 from jax.sharding import Mesh
 
+from kslc_jax import config as config_lib
 from kslc_jax import files, physics, train_step
 from kslc_jax.checkpoint_format import identity
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.fingerprint import changes, fingerprint
 from kslc_jax.networks import Params
 from kslc_jax.policy import policy_name
 from kslc_jax.runtime import Watchdog
@@ -164,6 +167,10 @@ def _starting_from(
                 f"cannot start from {path}: it is of the robot {theirs['name']}, not of "
                 f"{ours['name']}, or its joints have another order"
             )
+        if policy.config.physics.robot != config.physics.robot and (
+            changed := changes(policy.robot or {}, fingerprint(config.physics.robot))
+        ):
+            warnings.warn(f"{path} was trained with another robot: {changed}", stacklevel=2)
         try:
             jax.eval_shape(start, like, policy.params, policy.curriculum)
         except ValueError as error:
@@ -321,8 +328,10 @@ def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
     if devices.several():
         on += f", {jax.process_count()} processes"
     need = memory.estimate(config, count)
+    robot = config.physics.robot
+    copied = f", robot {robot}" if config_lib.is_description(robot) else ""
     return (
         f"{n} environments x {t} steps = {config.batch_size} samples an update, "
         f"{config.run.steps / 1e6:.2f}M steps in all; engine {engine} on {on}, about "
-        f"{memory.shown(need)} of memory{' each' * (count > 1)}; run folder {run_dir}"
+        f"{memory.shown(need)} of memory{' each' * (count > 1)}; run folder {run_dir}{copied}"
     )

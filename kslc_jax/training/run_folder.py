@@ -16,7 +16,7 @@ from typing import Any
 
 import jax
 
-from kslc_jax import __version__, files, networks, physics
+from kslc_jax import __version__, files, networks, physics, similar
 from kslc_jax import config as config_lib
 from kslc_jax.checkpoint_format import (
     has_checkpoints,
@@ -261,8 +261,9 @@ def _require_same(run_dir: Path, wanted: Config) -> None:
     try:
         difference(stored, wanted)
     except ConfigError as error:
+        presets = {n: similar.preset(n, wanted.physics.robot) for n in config_lib.PRESETS}
         names = (run_dir.with_name(f"{run_dir.name}-{i}") for i in itertools.count(2))
-        command = ["python", "-m", "kslc_jax.train", *config_lib.options(wanted)]
+        command = ["python", "-m", "kslc_jax.train", *config_lib.options(wanted, presets)]
         command += ["--run-dir", str(next(name for name in names if not name.exists()))]
         where = "from the start"
         if _networks(stored) == _networks(wanted):
