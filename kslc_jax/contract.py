@@ -38,7 +38,7 @@ def write(policy: Policy, out: Path) -> list[Path]:
     beside = [out.with_suffix(suffix) for suffix in (".json", ".xml", ".npz")]
     budget = policy.config.env.action_delay * policy.config.control_dt
     files.write_json(beside[0], metadata(policy) | {"latency_budget": budget})
-    beside[1].write_text(mjcf(policy))
+    beside[1].write_text(mjcf(policy), encoding="utf-8")
     trace: dict[str, Any] = golden(policy)
     np.savez_compressed(beside[2], **trace)
     return beside

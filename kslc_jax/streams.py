@@ -29,13 +29,16 @@ class _Sink(io.FileIO):
 
 
 def _lasting(stream: TextIO) -> tuple[TextIO, _Sink]:
-    """(a stream like `stream` on which no write fails, its sink)."""
+    """(a stream like `stream` on which no write fails, its sink).
+
+    A character that the encoding lacks, say of a path, becomes an escape such as \\xf6.
+    """
     stream.flush()
     sink = _Sink(stream.fileno(), "w", closefd=False)
     text = io.TextIOWrapper(
         io.BufferedWriter(sink),
         encoding=stream.encoding,
-        errors=stream.errors,
+        errors="backslashreplace" if stream.errors == "strict" else stream.errors,
         line_buffering=bool(stream.line_buffering or stream.write_through),
     )
     return text, sink

@@ -11,7 +11,7 @@ import pytest
 from kslc_jax import cli, streams
 
 COMMANDS = ["train", "evaluate", "sim2sim", "play", "export", "plots", "compare", "learning"]
-COMMANDS += ["reproduce", "doctor"]
+COMMANDS += ["reproduce", "doctor", "judge"]
 
 
 @pytest.fixture
@@ -67,6 +67,16 @@ def test_output_onto_a_full_disk(needs_output, code, monkeypatch, capsys):
         assert cli.run(lambda: print("table"), needs_output=needs_output) == code
     said = capsys.readouterr().err
     assert said == "error: cannot write the output: No space left on device\n" * needs_output
+
+
+def test_characters_that_the_terminal_lacks_are_escaped(monkeypatch):
+    reader, writer = os.pipe()
+    with io.TextIOWrapper(io.FileIO(writer, "w"), encoding="ascii") as narrow:
+        monkeypatch.setattr(sys, "stdout", narrow)
+        monkeypatch.setattr(sys, "__stdout__", narrow)
+        assert cli.run(lambda: print("wrote runs/l\xf6we \u2502")) == 0
+    with io.FileIO(reader) as file:
+        assert file.readall() == rb"wrote runs/l\xf6we \u2502" + b"\n"
 
 
 def test_streams_of_a_notebook_stay():
