@@ -20,6 +20,7 @@ from kslc_jax import (
     contract,
     curriculum,
     env,
+    fingerprint,
     gait,
     networks,
     observations,
@@ -38,7 +39,8 @@ from kslc_jax.evaluation import gait_metrics, trials
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robots import copying, description
 from kslc_jax.robots.description import RobotError
-from kslc_jax.training import run_folder
+from kslc_jax.training import loop, run_folder
+from kslc_jax.training.checkpoint_process import LocalStorage
 
 BIPED = str(Path(__file__).parent / "data" / "biped.toml")
 ENVS = 3
@@ -379,6 +381,17 @@ def test_a_training_does_not_start_from_another_robots_policy(tmp_path, capsys):
         said.endswith("of the robot XBot-L, not of biped, or its joints have another order")
         and "\n" not in said
     )
+
+
+def test_starting_from_another_robots_policy_names_the_numbers(mine, untrained, tmp_path):
+    setup, home = mine
+    about = home / "about" / "biped.toml"
+    about.write_text(about.read_text().replace("kp = 60", "kp = 66"))
+    known = dataclasses.replace(untrained, robot=fingerprint.fingerprint(BIPED))
+    policy.save_policy(known, tmp_path / "policy")
+    with pytest.warns(UserWarning, match="trained with another robot: kp of .* 60 -> 66"):
+        init, _ = train_step.make(setup)
+        loop._starting_from(tmp_path / "policy", setup, init, LocalStorage(), None)
 
 
 def test_a_robot_is_chosen_by_its_own_option(capsys):

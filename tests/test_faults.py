@@ -585,6 +585,13 @@ def restored(like):
     return restore
 
 
+def test_no_checkpoint_names_a_folder(saved, restored, tmp_path):
+    """Run folders are published. Orbax would write where they were."""
+    stored = [path for path in saved(tmp_path, 1, 2).rglob("*") if path.is_file()]
+    assert len(stored) > 20 and not [p for p in stored if bytes(tmp_path) in p.read_bytes()]
+    assert restored(tmp_path) == (2, [])
+
+
 class TestFullDisk:
     def test_save_fails_in_one_line_and_leaves_nothing(self, saved, restored, state_at, disk):
         saved(disk, 1)

@@ -99,6 +99,7 @@ class Store:
         """Blocks until the last save is on disk; CheckpointError if it failed."""
         with self._writing():
             self._manager.wait_until_finished()
+        with contextlib.suppress(OSError):  # orbax may be removing an old checkpoint
             forget_where(self.folder)
 
     @contextlib.contextmanager
