@@ -47,7 +47,8 @@ class Args:
     """paper, laptop, debug, baseline or baseline-laptop."""
     robot: str = XBOT_L
     """xbot_l, unitree_g1, unitree_h1, booster_t1, berkeley_humanoid, or the path of a description
-    (docs/own_robot.md). The preset is scaled to the robot's size."""
+    (docs/own_robot.md). The preset is scaled to the robot's size. The run folder keeps a copy of
+    the robot."""
     without: tuple[str, ...] = ()
     """Parts of the method to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
