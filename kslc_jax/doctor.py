@@ -134,7 +134,10 @@ def check_disk() -> str:
 
 def check_cache() -> str:
     """The folder of the compilation cache, if it can be written."""
-    folder = Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or runtime.cache_dir())
+    given = os.environ.get("JAX_COMPILATION_CACHE_DIR") or runtime.cache_dir()
+    if given is None:
+        raise OSError("this user has no home folder")
+    folder = Path(given)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         return str(folder)

@@ -63,10 +63,10 @@ GL_LIBRARIES = {"egl": "EGL", "osmesa": "OSMesa"}
 """Value of MUJOCO_GL -> the library that it needs; the better one first."""
 
 
-def cache_dir() -> Path:
-    """Folder of the persistent compilation cache."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "kslc_jax"
+def cache_dir() -> Path | None:
+    """Folder of the persistent compilation cache; None for a user without a home folder."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return None if base.startswith("~") else Path(base) / "kslc_jax"
 
 
 def prepare(gl: bool = True) -> None:
@@ -78,7 +78,8 @@ def prepare(gl: bool = True) -> None:
     with a warning on stderr.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_dir()))
+    if folder := cache_dir():
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
     if usable_cpus() < affine_cpus():
         os.environ.setdefault(XLA_THREADS, str(usable_cpus()))
     if others := fix_numerics():

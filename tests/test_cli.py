@@ -114,6 +114,15 @@ def test_variables_that_change_numbers_are_overridden(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
+def test_a_user_without_a_home_folder_has_no_cache(monkeypatch):
+    """As in a container that runs with any user id; then Path.home() raises."""
+    for name in ("HOME", "XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os, "getuid", lambda: 987_654_321)
+    runtime.prepare(gl=False)
+    assert runtime.cache_dir() is None and "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
 def test_variables_that_change_nothing_are_no_word(monkeypatch, capsys):
     for name in NUMERICS:
         monkeypatch.delenv(name, raising=False)
