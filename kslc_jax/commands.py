@@ -4,7 +4,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax import maths
+from kslc_jax import draws, maths
 from kslc_jax.config import CommandConfig
 
 TURNING = 0.1
@@ -34,23 +34,21 @@ def sample(
     `narrow_speed`, vy and the change of heading shrink linearly with |vx|. A share `stand_fraction`
     has zero velocity and keeps its heading. A share `forward_fraction` goes straight ahead.
     """
-    keys = jax.random.split(key, 5)
+    part, speed, sideways, turn, kind = jax.random.uniform(key, (5,))
     low, high = vx_range
     if config.slow_fraction + config.top_fraction > 0:
-        part = jax.random.uniform(keys[4])
         slow = part < config.slow_fraction
         top = (part >= config.slow_fraction) & (part < config.slow_fraction + config.top_fraction)
         low = jnp.where(top, jnp.maximum(high - top_width, low), low)
         high = jnp.where(slow, jnp.clip(config.slow_speed, *vx_range), high)
-    vx = jax.random.uniform(keys[0], minval=low, maxval=high)
-    vy = jax.random.uniform(keys[1], minval=config.vy[0], maxval=config.vy[1])
-    heading = jax.random.uniform(keys[2], minval=config.heading[0], maxval=config.heading[1])
+    vx = draws.between(speed, low, high)
+    vy = draws.between(sideways, *config.vy)
+    heading = draws.between(turn, *config.heading)
     if config.narrow_speed > 0:
         share = jnp.clip(1.0 - jnp.abs(vx) / config.narrow_speed, 0.0, 1.0)
         vy = vy * share
         heading = yaw + share * maths.wrap_angle(heading - yaw)
 
-    kind = jax.random.uniform(keys[3])
     stand = kind < config.stand_fraction
     forward = kind < config.stand_fraction + config.forward_fraction
     vx = jnp.where(stand, 0.0, vx)
@@ -66,7 +64,7 @@ def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> j
     if config.shortest_seconds == 0:
         return jnp.asarray(longest)
     shortest = round(config.shortest_seconds / control_dt)
-    return jax.random.randint(key, (), shortest, longest + 1)
+    return draws.integer_between(jax.random.uniform(key), shortest, longest)
 
 
 def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:
@@ -82,7 +80,7 @@ def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) 
     vx and vy become zero in the dead zone. With `config.stand_still`, such a command means "stand"
     (`moving` is False) unless it turns faster than `TURNING`.
     """
-    walks = jnp.hypot(velocity[0], velocity[1]) > config.dead_zone
+    walks = maths.norm(velocity[:2]) > config.dead_zone
     velocity = velocity * jnp.stack([walks, walks, jnp.ones((), bool)])
     if not config.stand_still:
         return command.replace(velocity=velocity, moving=jnp.ones((), bool))

@@ -63,7 +63,13 @@ class Outcome:
 
 def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     """Starts a new episode of one environment."""
-    keys = jax.random.split(key, 6)
+    key_start, key_noise = jax.random.split(key)
+    return observe(config, begin(config, key_start, curriculum), key_noise)
+
+
+def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
+    """The start of an episode, before its first observation."""
+    keys = jax.random.split(key, 5)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
     joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
@@ -71,13 +77,13 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
     now = signals.read(robot, state)
     command = _sample_command(config, keys[1], curriculum, now)
-    blank = EnvState(
+    return EnvState(
         physics=state,
         dynamics=randomize.sample(config.randomize, robot, keys[2]),
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
         command_since=jnp.zeros((), jnp.int32),
-        command_until=commands.holding_steps(config.command, keys[5], config.control_dt),
+        command_until=commands.holding_steps(config.command, keys[4], config.control_dt),
         history=jnp.zeros((config.env.frames, observations.actor_width(robot))),
         privileged_history=jnp.zeros(
             (config.env.privileged_frames, observations.critic_width(robot))
@@ -88,7 +94,6 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         push=jnp.zeros(5),
         time=jnp.zeros((), jnp.int32),
     )
-    return observe(config, blank, now, keys[4])
 
 
 def step(
@@ -143,9 +148,9 @@ def step(
     )
     state = _resample(config, state, keys[1], curriculum, now)
     state = _push(config, state, keys[2])
-    state = observe(config, state, signals.read(robot, state.physics), keys[3])
-    fresh = reset(config, keys[4], curriculum)
-    return maths.tree_where(outcome.terminated | outcome.truncated, fresh, state), outcome
+    fresh = begin(config, keys[3], curriculum)
+    state = maths.tree_where(outcome.terminated | outcome.truncated, fresh, state)
+    return observe(config, state, keys[4]), outcome
 
 
 def _outcome(
@@ -263,11 +268,11 @@ def _push(config: Config, state: EnvState, key: jax.Array) -> EnvState:
     )
 
 
-def observe(config: Config, state: EnvState, now: Signals, key: jax.Array) -> EnvState:
+def observe(config: Config, state: EnvState, key: jax.Array) -> EnvState:
     """Appends the present actor and critic frames to the histories."""
     robot = physics.robot_for(config.physics)
     src = observations.Sources(
-        signals=now,
+        signals=signals.read(robot, state.physics),
         gait=state.gait,
         command=state.command,
         dynamics=state.dynamics,

@@ -1,10 +1,13 @@
 """Domain randomisation: physical parameters that differ per robot, sampled at every reset."""
 
+import dataclasses
+
 import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax.config import ConfigError, RandomizeConfig, Range
+from kslc_jax import draws
+from kslc_jax.config import ConfigError, RandomizeConfig
 from kslc_jax.robot import Robot
 
 LIGHTEST = 0.05
@@ -58,31 +61,18 @@ def require_trunk(config: RandomizeConfig, robot: Robot) -> None:
 
 
 def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
-    """Draws the parameters of one episode. Each is uniform in its configured range.
+    """Draws the parameters of one episode. Each is uniform in the range of its name in `config`.
 
     Raises:
       ConfigError: see `require_trunk`.
     """
     require_trunk(config, robot)
-    keys = jax.random.split(key, 11)
-    joints, links = (robot.count,), (robot.count + 1,)
-
-    def uniform(key: jax.Array, bounds: Range, shape: tuple[int, ...] = ()) -> jax.Array:
-        return jax.random.uniform(key, shape, minval=bounds[0], maxval=bounds[1])
-
-    return Dynamics(
-        friction=uniform(keys[0], config.friction),
-        base_mass=uniform(keys[1], config.base_mass),
-        base_com=uniform(keys[2], config.base_com, (3,)),
-        kp=uniform(keys[3], config.kp, joints),
-        kd=uniform(keys[4], config.kd, joints),
-        motor_strength=uniform(keys[5], config.motor_strength, joints),
-        joint_friction=uniform(keys[6], config.joint_friction, joints),
-        link_mass=uniform(keys[8], config.link_mass, links),
-        link_com=uniform(keys[9], config.link_com, (*links, 3)),
-        hand_mass=uniform(keys[10], config.hand_mass),
-        noise=uniform(keys[7], config.noise),
-    )
+    names = [field.name for field in dataclasses.fields(Dynamics)]
+    shapes = [getattr(nominal(robot), name).shape for name in names]
+    units = draws.uniforms(key, *shapes)
+    ranges = [getattr(config, name) for name in names]
+    values = [draws.between(unit, *bounds) for unit, bounds in zip(units, ranges, strict=True)]
+    return Dynamics(*values)
 
 
 def link_masses(robot: Robot, dynamics: Dynamics) -> jax.Array:

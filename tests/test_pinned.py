@@ -4,7 +4,7 @@ exported as, compared with a stored file.
 A refactoring must not change a number. A commit that changes numbers on purpose also writes the
 file again:
 
-  python -m tests.test_pinned
+  python tests/test_pinned.py
 """
 
 import dataclasses
@@ -13,11 +13,10 @@ import importlib.metadata
 import json
 import os
 import platform
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
+import compiler  # noqa: F401  (before JAX)
 import jax
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ from kslc_jax import config as config_lib
 from kslc_jax import export, load_policy, train_step
 from kslc_jax.evaluation import trials
 
-ROOT = Path(__file__).parents[1]
 FILE = Path(__file__).parent / "data" / "pinned_metrics.json"
 
 STEPS = 20
@@ -43,7 +41,7 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
 
 
 def machine() -> dict[str, str]:
-    """The hardware and package versions that decide the last bit of a number."""
+    """All that decides the last bit of a number: hardware, compiler flags and package versions."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
@@ -51,6 +49,7 @@ def machine() -> dict[str, str]:
     return {
         "cpu": names[0] if names else platform.processor(),
         "avx512": str("avx512f" in flags[0].split() if flags else "unknown"),
+        "flags": os.environ["XLA_FLAGS"],
         **{name: importlib.metadata.version(name) for name in PACKAGES},
     }
 
@@ -81,14 +80,6 @@ def exported() -> str:
     return hashlib.sha256(export.to_onnx(load_policy(POLICY))).hexdigest()
 
 
-def measured(*parts: str) -> dict[str, Any]:
-    """`measure` in a new process, without the compiler flags of the other tests."""
-    plain = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
-    asked = [sys.executable, "-m", "tests.test_pinned", *parts]
-    done = subprocess.run(asked, env=plain, cwd=ROOT, capture_output=True, text=True, check=True)
-    return json.loads(done.stdout)
-
-
 def measure(part: str) -> Any:
     """The numbers of an engine, "mujoco" or "mjx", or those of the shipped policy, "policy"."""
     if part != "policy":
@@ -102,7 +93,7 @@ def check(engine: str) -> None:
     stored = json.loads(FILE.read_text())
     exact = stored["machine"] == machine()
     steps = STEPS if exact else FIRST_STEPS
-    found, wanted = measured(engine)[engine], stored[engine]
+    found, wanted = measure(engine), stored[engine]
     assert found.keys() == wanted.keys()
     for name, values in found.items():
         if exact:
@@ -118,7 +109,7 @@ def test_numbers_in_c_mujoco_are_pinned():
 
 def test_what_the_shipped_policy_does_is_pinned():
     stored = json.loads(FILE.read_text())
-    exact, now = stored["machine"] == machine(), measured("policy")["policy"]
+    exact, now = stored["machine"] == machine(), measure("policy")
     for fidelity in ("train", "high"):
         found, wanted = now[fidelity], stored["policy"][fidelity]
         if exact:
@@ -135,14 +126,11 @@ def test_numbers_in_mjx_are_pinned():
     check("mjx")
 
 
-def main(parts: list[str]) -> None:
-    """Prints the parts, or writes the file again if none is named."""
-    found = {part: measure(part) for part in parts or ("mujoco", "mjx", "policy")}
-    if parts:
-        print(json.dumps(found))
-    else:
-        FILE.write_text(json.dumps({"machine": machine(), **found}, indent=1) + "\n")
+def main() -> None:
+    """Writes the file again."""
+    found = {part: measure(part) for part in ("mujoco", "mjx", "policy")}
+    FILE.write_text(json.dumps({"machine": machine(), **found}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

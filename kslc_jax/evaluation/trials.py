@@ -131,8 +131,8 @@ def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> e
         velocity=jnp.append(command[:2], 0.0), heading=command[2], moving=jnp.zeros((), bool)
     )
     robot = physics.robot_for(config.physics)
-    now = signals.read(robot, state.physics)
-    steered = commands.steer(config.command, wanted, now.base_euler[2])
+    yaw = signals.read(robot, state.physics).base_euler[2]
+    steered = commands.steer(config.command, wanted, yaw)
     clock, stance = gait.clock_of(config.gait, state.gait.phase, steered)
     state = state.replace(
         command=steered,
@@ -140,7 +140,7 @@ def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> e
         history=jnp.zeros_like(state.history),
         privileged_history=jnp.zeros_like(state.privileged_history),
     )
-    return env.observe(config, state, now, jax.random.key(0))
+    return env.observe(config, state, jax.random.key(0))
 
 
 def with_command(
