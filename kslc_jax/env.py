@@ -10,7 +10,17 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax import commands, gait, maths, observations, physics, randomize, rewards, signals
+from kslc_jax import (
+    commands,
+    gait,
+    ground,
+    maths,
+    observations,
+    physics,
+    randomize,
+    rewards,
+    signals,
+)
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax.commands import Command
 from kslc_jax.config import Config
@@ -69,11 +79,16 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
     qpos = jnp.asarray(robot.default_qpos, jnp.float32).at[7:].add(joints)
     state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
-    now = signals.read(robot, state)
+    dynamics = randomize.sample(config.randomize, robot, keys[2])
+    if config.physics.uneven:
+        key_ground = jax.random.fold_in(key, len(keys))
+        drawn = ground.sample(config.physics.uneven, key_ground, curriculum.v_max)
+        dynamics = dynamics.replace(ground=drawn)
+    now = signals.read(robot, state, dynamics.ground)
     command = _sample_command(config, keys[1], curriculum, now)
     blank = EnvState(
         physics=state,
-        dynamics=randomize.sample(config.randomize, robot, keys[2]),
+        dynamics=dynamics,
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
         command_since=jnp.zeros((), jnp.int32),
@@ -124,7 +139,7 @@ def step(
     )
     broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.abs(new.qvel) < DIVERGED))
     new = maths.tree_where(broken, state.physics, new)
-    now = signals.read(robot, new)
+    now = signals.read(robot, new, state.dynamics.ground)
 
     command = commands.steer(config.command, state.command, now.base_euler[2])
     cycle = gait.cycle_time(config, command, curriculum.cycle_time, curriculum.v_max)
@@ -143,7 +158,8 @@ def step(
     )
     state = _resample(config, state, keys[1], curriculum, now)
     state = _push(config, state, keys[2])
-    state = observe(config, state, signals.read(robot, state.physics), keys[3])
+    now = signals.read(robot, state.physics, state.dynamics.ground)
+    state = observe(config, state, now, keys[3])
     fresh = reset(config, keys[4], curriculum)
     return maths.tree_where(outcome.terminated | outcome.truncated, fresh, state), outcome
 

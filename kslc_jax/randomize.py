@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax.config import ConfigError, RandomizeConfig, Range
+from kslc_jax.ground import Ground
 from kslc_jax.robot import Robot
 
 LIGHTEST = 0.05
@@ -26,6 +27,7 @@ class Dynamics:
     link_com: jax.Array  # [1 + n, 3] m, shift of the centre of mass, link frame, same order
     hand_mass: jax.Array  # [] kg added to the last link of each arm
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
+    ground: Ground | None = None  # uneven ground; None: the flat floor
 
 
 def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
