@@ -172,18 +172,16 @@ def window(ground: Ground, far: bool) -> np.ndarray:
 
 
 def place(ground: Ground, x, y, xp: Any = jnp):
-    """The window that a robot at x and y [..., m, world] stands on.
+    """The height field that a robot at x and y [m, world] stands on.
 
     Returns:
-      (position of its middle [..., 3, m, world], orientation [..., 4], far [...]: see `window`).
+      (position [3, m, world] of the point in its middle with the height -`reach`, orientation [4],
+      far []: see `window`).
     """
-    here = xp.stack(_to_own_frame(ground, x, y, xp), -1)
-    cell = xp.round(here / PERIOD)
+    along, across = (xp.round(x / PERIOD) for x in _to_own_frame(ground, x, y, xp))
     c, s = xp.cos(ground.yaw), xp.sin(ground.yaw)
-    rise = ground.slope * PERIOD + ground.stairs * PERIOD / TREAD
-    east, north = PERIOD * cell[..., 0], PERIOD * cell[..., 1]
-    middle = xp.stack([c * east - s * north, s * east + c * north, rise * cell[..., 0]], -1)
-    zero = xp.zeros_like(east)
-    half = zero + 0.5 * ground.yaw
-    quat = xp.stack([xp.cos(half), zero, zero, xp.sin(half)], -1)
-    return middle, quat, (cell != 0).any(-1)
+    rise = along * (ground.slope * PERIOD + ground.stairs * PERIOD / TREAD)
+    middle = xp.stack([c * along - s * across, s * along + c * across]) * PERIOD
+    zero, half = xp.zeros_like(along), 0.5 * ground.yaw
+    quat = xp.stack([xp.cos(half), zero, zero, xp.sin(half)])
+    return xp.append(middle, rise - reach(ground)), quat, (along != 0) | (across != 0)

@@ -137,8 +137,8 @@ def _with_height_field(
     robot: Robot, state: PhysicsState, ground: Ground, fields: dict[str, jax.Array]
 ) -> dict[str, jax.Array]:
     """Adds the window of the height field that the robot stands on to mjModel fields."""
-    middle, quat, far = ground_lib.place(ground, *state.qpos[:2])
-    pos, floor = middle - jnp.array([0.0, 0.0, ground_lib.reach(ground)]), robot.ground_geom_ids[0]
+    pos, quat, far = ground_lib.place(ground, *state.qpos[:2])
+    floor = robot.ground_geom_ids[0]
 
     def changed(name: str, value: jax.Array) -> jax.Array:
         before = fields.get(name, jnp.asarray(getattr(robot.mj_model, name)))

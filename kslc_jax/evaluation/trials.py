@@ -110,15 +110,17 @@ class Trial:
     steps: jax.Array  # [] int, control steps done
 
 
-def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
+def engine(
+    policy: Policy, fidelity: Fidelity, terrain: TerrainConfig | None = None
+) -> PhysicsConfig:
     """The physics config: that of the policy's training ("train"), or high fidelity ("high").
 
-    The floor is flat.
+    Without `terrain` the floor is flat.
     """
-    trained = policy.config.physics
+    trained, terrain = policy.config.physics, terrain or TerrainConfig()
     if fidelity == "high":
-        return HighFidelity(robot=trained.robot)
-    return dataclasses.replace(trained, terrain=TerrainConfig())
+        return HighFidelity(robot=trained.robot, terrain=terrain)
+    return dataclasses.replace(trained, terrain=terrain)
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
