@@ -10,7 +10,17 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax import commands, gait, maths, observations, physics, randomize, rewards, signals
+from kslc_jax import (
+    commands,
+    gait,
+    ground,
+    maths,
+    observations,
+    physics,
+    randomize,
+    rewards,
+    signals,
+)
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax.commands import Command
 from kslc_jax.config import Config
@@ -69,17 +79,21 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
 
 def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     """The start of an episode, before its first observation."""
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 6)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
     joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
     qpos = jnp.asarray(robot.default_qpos, jnp.float32).at[7:].add(joints)
     state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
-    now = signals.read(robot, state)
+    dynamics = randomize.sample(config.randomize, robot, keys[2])
+    if config.physics.uneven:
+        drawn = ground.sample(config.physics.uneven, keys[5], curriculum.v_max)
+        dynamics = dynamics.replace(ground=drawn)
+    now = signals.read(robot, state, dynamics.ground)
     command = _sample_command(config, keys[1], curriculum, now)
     return EnvState(
         physics=state,
-        dynamics=randomize.sample(config.randomize, robot, keys[2]),
+        dynamics=dynamics,
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
         command_since=jnp.zeros((), jnp.int32),
@@ -129,7 +143,7 @@ def step(
     )
     broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.abs(new.qvel) < DIVERGED))
     new = maths.tree_where(broken, state.physics, new)
-    now = signals.read(robot, new)
+    now = signals.read(robot, new, state.dynamics.ground)
 
     command = commands.steer(config.command, state.command, now.base_euler[2])
     cycle = gait.cycle_time(config, command, curriculum.cycle_time, curriculum.v_max)
@@ -272,7 +286,7 @@ def observe(config: Config, state: EnvState, key: jax.Array) -> EnvState:
     """Appends the present actor and critic frames to the histories."""
     robot = physics.robot_for(config.physics)
     src = observations.Sources(
-        signals=signals.read(robot, state.physics),
+        signals=signals.read(robot, state.physics, state.dynamics.ground),
         gait=state.gait,
         command=state.command,
         dynamics=state.dynamics,

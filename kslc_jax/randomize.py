@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from kslc_jax import draws
 from kslc_jax.config import ConfigError, RandomizeConfig
+from kslc_jax.ground import Ground
 from kslc_jax.robot import Robot
 
 LIGHTEST = 0.05
@@ -29,6 +30,7 @@ class Dynamics:
     link_com: jax.Array  # [1 + n, 3] m, shift of the centre of mass, link frame, same order
     hand_mass: jax.Array  # [] kg added to the last link of each arm
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
+    ground: Ground | None = None  # uneven ground; None: the flat floor
 
 
 def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
@@ -67,12 +69,13 @@ def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
       ConfigError: see `require_trunk`.
     """
     require_trunk(config, robot)
-    names = [field.name for field in dataclasses.fields(Dynamics)]
-    shapes = [getattr(nominal(robot), name).shape for name in names]
+    described = nominal(robot)
+    names = [f.name for f in dataclasses.fields(Dynamics) if hasattr(config, f.name)]
+    shapes = [getattr(described, name).shape for name in names]
     units = draws.uniforms(key, *shapes)
     ranges = [getattr(config, name) for name in names]
     values = [draws.between(unit, *bounds) for unit, bounds in zip(units, ranges, strict=True)]
-    return Dynamics(*values)
+    return described.replace(**dict(zip(names, values, strict=True)))
 
 
 def link_masses(robot: Robot, dynamics: Dynamics) -> jax.Array:

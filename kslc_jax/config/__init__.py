@@ -12,6 +12,7 @@ from kslc_jax.config.options import options
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
+    GROUNDS,
     XBOT_L,
     CommandConfig,
     Config,
@@ -29,6 +30,7 @@ from kslc_jax.config.schema import (
     RewardConfig,
     RewardWeights,
     RunConfig,
+    TerrainConfig,
     require_seed,
 )
 from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
@@ -36,6 +38,7 @@ from kslc_jax.config.storage import SCHEMA_VERSION, from_dict, to_dict
 __all__ = [
     "ABLATIONS",
     "COUNTER",
+    "GROUNDS",
     "PRESETS",
     "SCHEMA_VERSION",
     "XBOT_L",
@@ -55,6 +58,7 @@ __all__ = [
     "RewardConfig",
     "RewardWeights",
     "RunConfig",
+    "TerrainConfig",
     "from_dict",
     "options",
     "preset",

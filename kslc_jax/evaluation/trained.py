@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
-from kslc_jax.config import Config, RandomizeConfig
+from kslc_jax.config import GROUNDS, Config, RandomizeConfig, TerrainConfig
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Schedule
 from kslc_jax.evaluation.trials import Setting
@@ -34,6 +34,7 @@ def beyond(
     if schedule and _pace(schedule) < shortest - TOLERANCE:
         reasons.append("pace")
     reasons += _robot_reasons(trained.randomize, setting.randomize)
+    reasons += _ground_reasons(trained.physics.terrain, setting.physics.terrain)
     if setting.latency > trained.env.action_delay:
         reasons.append("latency")
     others = {"imu": any(setting.imu_offset), "punch": setting.punch, "arms": setting.hold_arms}
@@ -82,3 +83,8 @@ def _robot_reasons(trained: RandomizeConfig, tried: RandomizeConfig) -> list[str
     ]
     pushed = tried.push_seconds > 0 and tried.push_velocity > trained.push_velocity
     return reasons + ["push"] * pushed
+
+
+def _ground_reasons(trained: TerrainConfig, tried: TerrainConfig) -> list[str]:
+    larger = (getattr(tried, kind) > getattr(trained, kind) + TOLERANCE for kind in GROUNDS)
+    return ["ground"] * any(larger)

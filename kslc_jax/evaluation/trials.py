@@ -15,12 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax import commands, env, gait, maths, networks, observations, physics, randomize, signals
-from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.config import (
+    Config,
+    Fidelity,
+    HighFidelity,
+    PhysicsConfig,
+    RandomizeConfig,
+    TerrainConfig,
+)
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.evaluation import disturbances, schedules, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Leg, Schedule
 from kslc_jax.evaluation.variation import Body
+from kslc_jax.ground import Ground
 from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
 
@@ -81,10 +89,11 @@ class Trace:
     joint_vel: jax.Array  # [n] rad/s
     torque: jax.Array  # [n] N m
     contact: jax.Array  # [2] bool, left and right foot
-    foot_height: jax.Array  # [2] m, ankle-roll link
+    foot_height: jax.Array  # [2] m, ankle-roll link above the ground
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
     command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s] during the step
     leg: jax.Array  # int, number of the schedule's leg
+    ground: Ground | None = None  # uneven ground; None: the flat floor
 
 
 @flax.struct.dataclass
@@ -101,10 +110,17 @@ class Trial:
     steps: jax.Array  # [] int, control steps done
 
 
-def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
-    """The physics config: that of the policy's training ("train"), or high fidelity ("high")."""
-    trained = policy.config.physics
-    return HighFidelity(robot=trained.robot) if fidelity == "high" else trained
+def engine(
+    policy: Policy, fidelity: Fidelity, terrain: TerrainConfig | None = None
+) -> PhysicsConfig:
+    """The physics config: that of the policy's training ("train"), or high fidelity ("high").
+
+    Without `terrain` the floor is flat.
+    """
+    trained, terrain = policy.config.physics, terrain or TerrainConfig()
+    if fidelity == "high":
+        return HighFidelity(robot=trained.robot, terrain=terrain)
+    return dataclasses.replace(trained, terrain=terrain)
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
@@ -308,8 +324,8 @@ def _frame_error(setting: Setting, robot: Robot) -> np.ndarray:
 
 
 def _record(robot: Robot, trial: Trial, command: jax.Array, mass: jax.Array) -> Trace:
-    state = trial.env.physics
-    now = signals.read(robot, state)
+    state, ground = trial.env.physics, trial.env.dynamics.ground
+    now = signals.read(robot, state, ground)
     return Trace(
         alive=trial.alive,
         mass=mass,
@@ -324,6 +340,7 @@ def _record(robot: Robot, trial: Trial, command: jax.Array, mass: jax.Array) -> 
         angular_momentum=now.angular_momentum,
         command=command,
         leg=trial.leg.number,
+        ground=ground,
     )
 
 
