@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from kslc_jax import (
     commands,
+    disturbances,
     gait,
     ground,
     maths,
@@ -25,6 +26,7 @@ from kslc_jax import curriculum as curriculum_lib
 from kslc_jax.commands import Command
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.disturbances import Disturbances
 from kslc_jax.gait import GaitState
 from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics
@@ -51,6 +53,7 @@ class EnvState:
     last_base_velocity: jax.Array  # [6] world
     push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
     time: jax.Array  # [] int, control steps since the reset
+    disturbances: Disturbances | None = None  # None: the config has none
 
 
 @flax.struct.dataclass
@@ -79,7 +82,7 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
 
 def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     """The start of an episode, before its first observation."""
-    keys = jax.random.split(key, 6)
+    keys = jax.random.split(key, 7)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
     joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
@@ -107,6 +110,7 @@ def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         last_base_velocity=jnp.zeros(6),
         push=jnp.zeros(5),
         time=jnp.zeros((), jnp.int32),
+        disturbances=disturbances.start(config.randomize, keys[6], qpos[7:]),
     )
 
 
@@ -138,9 +142,11 @@ def step(
     noise = state.dynamics.noise
     action = _applied_action(config, action, state.last_action, noise, keys[0])
     target = jnp.asarray(robot.default_qpos[7:], jnp.float32) + config.env.action_scale * action
-    new = simulate(
-        config.physics, state.physics, target, state.dynamics, config.randomize.ground_friction
+    disturbed, target, force = disturbances.apply(
+        config.randomize, robot, state.disturbances, state.time, target, config.control_dt
     )
+    floor = config.randomize.ground_friction
+    new = simulate(config.physics, state.physics, target, state.dynamics, floor, force)
     broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.abs(new.qvel) < DIVERGED))
     new = maths.tree_where(broken, state.physics, new)
     now = signals.read(robot, new, state.dynamics.ground)
@@ -159,6 +165,7 @@ def step(
         last_last_action=state.last_action,
         last_base_velocity=now.base_velocity,
         time=time,
+        disturbances=disturbed,
     )
     state = _resample(config, state, keys[1], curriculum, now)
     state = _push(config, state, keys[2])

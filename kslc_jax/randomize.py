@@ -29,6 +29,7 @@ class Dynamics:
     link_mass: jax.Array  # [1 + n] factor on mass and inertia, order of robot.link_body_ids
     link_com: jax.Array  # [1 + n, 3] m, shift of the centre of mass, link frame, same order
     hand_mass: jax.Array  # [] kg added to the last link of each arm
+    sole: jax.Array  # [k] m, shift of each sole sphere, see robot.sole_inward
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
     ground: Ground | None = None  # uneven ground; None: the flat floor
 
@@ -47,6 +48,7 @@ def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
         link_mass=jnp.ones(links),
         link_com=jnp.zeros((links, 3)),
         hand_mass=jnp.zeros(()),
+        sole=jnp.zeros(len(robot.sole_geom_ids)),
         noise=jnp.ones(()),
     )
 
@@ -103,12 +105,14 @@ def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> di
     model, trunk, links = robot.mj_model, robot.trunk_body_id, robot.link_body_ids
     contact_friction = 0.5 * (dynamics.friction + ground_friction)
     mass = link_masses(robot, dynamics)
+    spheres, shift = robot.sole_geom_ids, dynamics.sole[:, None] * robot.sole_inward
     com = jnp.asarray(model.body_ipos).at[links].add(dynamics.link_com)
     scale = mass[1:] / model.body_mass[1:]  # body 0, the world, has no mass
     return {
         "geom_friction": jnp.asarray(model.geom_friction)
         .at[robot.foot_geom_ids, 0]
         .set(contact_friction),
+        "geom_pos": jnp.asarray(model.geom_pos).at[spheres].add(shift),
         "body_mass": mass,
         "body_inertia": jnp.asarray(model.body_inertia).at[1:].multiply(scale[:, None]),
         "body_ipos": com.at[trunk].add(dynamics.base_com),

@@ -19,6 +19,10 @@ from kslc_jax.config import XBOT_L, Fidelity, TerrainConfig
 from kslc_jax.robots import anatomy, build, description, floors
 from kslc_jax.robots.anatomy import Anatomy
 
+SOLE_RISE = 0.02
+"""Height that a sole's contact point gains per distance that it moves inwards. Half a millimetre
+decides which points of a flat foot carry the load."""
+
 
 @dataclass(frozen=True, eq=False)
 class Robot:
@@ -42,6 +46,8 @@ class Robot:
     hand_points: np.ndarray  # [2, 3] m, centre of each hand, frame of its link
     subtree: np.ndarray  # [B, B] 1 if body `column` is in the subtree of body `row`
     foot_geom_ids: np.ndarray  # sole spheres; at high fidelity also the foot boxes
+    sole_geom_ids: np.ndarray  # [k] sole spheres
+    sole_inward: np.ndarray  # [k, 3] way of a contact point to its sole's middle, see _inward
     terrain: TerrainConfig | None  # uneven ground; None: the flat floor
     ground_geom_ids: np.ndarray  # what moves with uneven ground: a plane per sphere, or the floor
     torso_box_center: np.ndarray  # [3] m, base frame
@@ -141,6 +147,8 @@ def load(
     stand_height = float(model.numeric("stand_height").data[0])
     xbot = load() if name != XBOT_L else None
     at_home = _at_home(model)
+    is_sphere = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    spheres = np.flatnonzero(is_sphere & (model.geom_priority > 0))
     return Robot(
         mj_model=model,
         name=spec.modelname,
@@ -160,6 +168,8 @@ def load(
         hand_points=_hand_points(model, hands),
         subtree=_subtree(model),
         foot_geom_ids=np.flatnonzero(model.geom_priority > 0),
+        sole_geom_ids=spheres,
+        sole_inward=_inward(at_home, spheres),
         terrain=terrain,
         ground_geom_ids=_ground_geoms(model, fidelity) if terrain else np.array([], int),
         torso_box_center=box.pos.copy(),
@@ -206,6 +216,22 @@ def _at_home(model: mujoco.MjModel) -> mujoco.MjData:
     mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
     mujoco.mj_forward(model, data)
     return data
+
+
+def _inward(at_home: mujoco.MjData, spheres: np.ndarray) -> np.ndarray:
+    """[k, 3] direction in which each sole sphere moves when its sole gets smaller, link frame.
+
+    It leads to the middle of the foot's spheres. It has the length 1 along the ground, and rises by
+    `SOLE_RISE`.
+    """
+    feet, ways = at_home.model.geom_bodyid[spheres], np.zeros((len(spheres), 3))
+    for foot in np.unique(feet):
+        points = at_home.geom_xpos[spheres[feet == foot]]
+        offset = (points.mean(axis=0) - points)[:, :2]
+        along = offset / np.linalg.norm(offset, axis=1, keepdims=True)
+        rising = np.column_stack([along, np.full(len(along), SOLE_RISE)])
+        ways[feet == foot] = rising @ at_home.xmat[foot].reshape(3, 3)
+    return ways
 
 
 def _apart(data: mujoco.MjData, sensor: str) -> float:

@@ -170,12 +170,13 @@ def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
         seconds=args.seconds,
         noise=args.noise,
         latency=args.latency,
-        punch=args.punch,
-        hold_arms=args.hold_arms,
         heading=args.heading[0],
         simulate=simulator(args.engine),
     )
-    return dataclasses.replace(plain, **settings(made, plain.randomize))
+    disturbed = dataclasses.replace(
+        plain.randomize, punch=(args.punch, args.punch), held_arms=float(args.hold_arms)
+    )
+    return dataclasses.replace(plain, **settings(made, disturbed))
 
 
 CONDITIONS = (

@@ -78,6 +78,8 @@ def factors(robot: Robot) -> dict[str, float]:
         "randomize.link_com": length,
         "randomize.hand_mass": mass,
         "randomize.joint_friction": mass * length,
+        "randomize.sole": length,
+        "randomize.punch": mass,
         "randomize.push_velocity": time,
         "randomize.push_angular": 1.0 / time,
         "rewards.momentum_scale": mass * length * time,

@@ -13,6 +13,7 @@ from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
     GROUNDS,
+    MOST_INSET,
     XBOT_L,
     CommandConfig,
     Config,
@@ -39,6 +40,7 @@ __all__ = [
     "ABLATIONS",
     "COUNTER",
     "GROUNDS",
+    "MOST_INSET",
     "PRESETS",
     "SCHEMA_VERSION",
     "XBOT_L",

@@ -310,6 +310,10 @@ class GaitConfig:
         require(self.full_speed > 0, "gait.full_speed must be positive")
 
 
+MOST_INSET = 0.04
+"""Largest distance [m] by which the edge of a sole moves inwards. It leaves the sole some area."""
+
+
 @dataclass(frozen=True)
 class RandomizeConfig:
     """Domain randomisation, sampled at every reset. Two equal bounds mean a constant."""
@@ -336,6 +340,9 @@ class RandomizeConfig:
     """Shift of each link's centre of mass, per axis [m]."""
     hand_mass: Range = (0.0, 0.0)
     """Mass added to the last link of each arm, at its centre of mass [kg]."""
+    sole: Range = (0.0, 0.0)
+    """Distance [m] by which each contact point of a sole lies nearer to the sole's middle. It is
+    then also a little higher, so that two to four points of a flat foot carry the load."""
     noise: Range = (1.0, 1.0)
     """Factor on observation noise, action noise and action delay of an episode."""
     push_seconds: float = 4.0
@@ -347,6 +354,12 @@ class RandomizeConfig:
     push_adds: bool = True
     """True: a push is added to the base's velocity. False: it replaces the velocity (HG). At
     3.5 m/s a replaced velocity is like a wall, not like a push."""
+    punch: Range = (0.0, 0.0)
+    """Size [N] of a force that acts for 0.08 s at a random link in a random direction, every 4 s.
+    0: no punches."""
+    held_arms: float = 0.0
+    """Share of the episodes in which the arms follow slow random targets in place of the actions,
+    as if somebody else moved them."""
 
     def __post_init__(self):
         for f in dataclasses.fields(self):
@@ -361,9 +374,13 @@ class RandomizeConfig:
             "joint_friction",
             "noise",
             "hand_mass",
+            "sole",
+            "punch",
         ):
             require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
         require(self.link_mass[0] > 0, "randomize.link_mass must be positive")
+        require(self.sole[1] <= MOST_INSET, f"randomize.sole must be at most {MOST_INSET} m")
+        require(0 <= self.held_arms <= 1, "randomize.held_arms must lie in [0, 1]")
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from kslc_jax.config import GROUNDS, ConfigError, RandomizeConfig, TerrainConfig
-
-MOST_INSET = 0.04
-"""Largest `Variation.sole` [m]. It leaves the soles some area."""
+from kslc_jax.config import GROUNDS, MOST_INSET, ConfigError, RandomizeConfig, TerrainConfig
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def beyond(
     reasons += _ground_reasons(trained.physics.terrain, setting.physics.terrain)
     if setting.latency > trained.env.action_delay:
         reasons.append("latency")
-    others = {"imu": any(setting.imu_offset), "punch": setting.punch, "arms": setting.hold_arms}
+    others: dict[str, bool | float] = {"imu": any(setting.imu_offset)}
     for field in dataclasses.fields(Variation):
         others[field.name] = getattr(setting.variation, field.name)
     reasons += [name for name, value in others.items() if value]
@@ -82,7 +82,9 @@ def _robot_reasons(trained: RandomizeConfig, tried: RandomizeConfig) -> list[str
         if mine[0] < theirs[0] - TOLERANCE or mine[1] > theirs[1] + TOLERANCE
     ]
     pushed = tried.push_seconds > 0 and tried.push_velocity > trained.push_velocity
-    return reasons + ["push"] * pushed
+    punched = tried.punch[1] > trained.punch[1]
+    held = tried.held_arms > 0 and trained.held_arms == 0
+    return reasons + ["push"] * pushed + ["punch"] * punched + ["arms"] * held
 
 
 def _ground_reasons(trained: TerrainConfig, tried: TerrainConfig) -> list[str]:

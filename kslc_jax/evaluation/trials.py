@@ -24,7 +24,7 @@ from kslc_jax.config import (
     TerrainConfig,
 )
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.evaluation import disturbances, schedules, variation
+from kslc_jax.evaluation import schedules, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Leg, Schedule
 from kslc_jax.evaluation.variation import Body
@@ -68,10 +68,6 @@ class Setting:
     """Commands that change; None: one constant command per robot."""
     heading: float = 0.0
     """Heading [rad] at the start. It is also the commanded heading until a schedule changes it."""
-    punch: float = 0.0
-    """Force [N] of the punches, see `disturbances.punch`; 0: no punches."""
-    hold_arms: bool = False
-    """True: the arms follow random targets in place of the policy's actions."""
     variation: Variation = AS_DESCRIBED
     """Differences between the robots beyond those of `randomize`."""
 
@@ -104,10 +100,8 @@ class Trial:
     alive: jax.Array  # [] bool
     queue: jax.Array  # [latency, n] delayed actions, the next one first
     leg: Leg
-    arms: jax.Array  # [n] rad, joint targets of held arms
     body: Body
     key: jax.Array  # random key of this robot
-    steps: jax.Array  # [] int, control steps done
 
 
 def engine(
@@ -245,10 +239,8 @@ def _start(
         alive=jnp.ones((), bool),
         queue=jnp.zeros((setting.latency, len(state.last_action))),
         leg=leg,
-        arms=state.physics.qpos[7:],
         body=variation.sample(setting.variation, robot, key_body),
         key=own,
-        steps=jnp.zeros((), jnp.int32),
     )
 
 
@@ -269,49 +261,35 @@ def _advance(
 ) -> tuple[Trial, Trace]:
     """One control step of one robot."""
     robot, dt = physics.robot_for(config.physics), config.control_dt
-    leg, arms = trial.leg, trial.arms
+    leg = trial.leg
     if setting.schedule:
         qpos = trial.env.physics.qpos
         yaw = maths.quat_to_euler(qpos[3:7])[2]
         leg = schedules.update(setting.schedule, config.command, leg, trial.key, yaw, qpos[:2], dt)
-    if setting.hold_arms:
-        arms = disturbances.walk_arms(robot, arms, trial.key, trial.steps, dt)
     state = with_command(config, trial.env, leg.velocity, leg.heading)
     action = policy.act_on(state.history + _frame_error(setting, robot))
     queue = jnp.concatenate([trial.queue, action[None]])
-    simulate = _simulator(config, setting, robot, trial.replace(arms=arms), key)
+    simulate = _simulator(setting, robot, trial.body, key)
     after, outcome = step(config, state, queue[0], key, policy.curriculum, simulate=simulate)
     trial = trial.replace(
         env=after,
         alive=trial.alive & ~outcome.terminated,
         queue=queue[1:],
         leg=leg,
-        arms=arms,
-        steps=trial.steps + 1,
     )
     mass = randomize.total_mass(robot, after.dynamics)
     mass += len(robot.hand_body_ids) * setting.variation.hands
     return trial, _record(robot, trial, state.command.velocity, mass)
 
 
-def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key: jax.Array):
-    """The engine with the setting's disturbances. It has the signature of `physics.step`."""
-    engine, more = setting.simulate or physics.step, {}
-    if setting.punch:
-        more["force"] = disturbances.punch(
-            robot, setting.punch, trial.key, trial.steps, config.control_dt
-        )
-    if setting.variation != AS_DESCRIBED:
-        key_body = jax.random.fold_in(key, 1)
-        more["alter"] = functools.partial(
-            variation.alter, setting.variation, robot, trial.body, key_body
-        )
-
-    def simulate(config: PhysicsConfig, state: physics.PhysicsState, target: jax.Array, *rest):
-        target = jnp.where(robot.is_arm & setting.hold_arms, trial.arms, target)
-        return engine(config, state, target, *rest, **more)
-
-    return simulate
+def _simulator(setting: Setting, robot: Robot, body: Body, key: jax.Array):
+    """The engine with the setting's variation. It has the signature of `physics.step`."""
+    engine = setting.simulate or physics.step
+    if setting.variation == AS_DESCRIBED:
+        return engine
+    key_body = jax.random.fold_in(key, 1)
+    alter = functools.partial(variation.alter, setting.variation, robot, body, key_body)
+    return functools.partial(engine, alter=alter)
 
 
 def _frame_error(setting: Setting, robot: Robot) -> np.ndarray:
