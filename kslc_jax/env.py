@@ -10,11 +10,23 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 
-from kslc_jax import commands, gait, maths, observations, physics, randomize, rewards, signals
+from kslc_jax import (
+    commands,
+    disturbances,
+    gait,
+    ground,
+    maths,
+    observations,
+    physics,
+    randomize,
+    rewards,
+    signals,
+)
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax.commands import Command
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
+from kslc_jax.disturbances import Disturbances
 from kslc_jax.gait import GaitState
 from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics
@@ -41,6 +53,7 @@ class EnvState:
     last_base_velocity: jax.Array  # [6] world
     push: jax.Array  # [5] last push: m/s (x, y), rad/s (3)
     time: jax.Array  # [] int, control steps since the reset
+    disturbances: Disturbances | None = None  # None: the config has none
 
 
 @flax.struct.dataclass
@@ -69,17 +82,21 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
 
 def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     """The start of an episode, before its first observation."""
-    keys = jax.random.split(key, 5)
+    keys = jax.random.split(key, 7)
     robot = physics.robot_for(config.physics)
     noise = config.env.reset_joint_noise
     joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
     qpos = jnp.asarray(robot.default_qpos, jnp.float32).at[7:].add(joints)
     state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
-    now = signals.read(robot, state)
+    dynamics = randomize.sample(config.randomize, robot, keys[2])
+    if config.physics.uneven:
+        drawn = ground.sample(config.physics.uneven, keys[5], curriculum.v_max)
+        dynamics = dynamics.replace(ground=drawn)
+    now = signals.read(robot, state, dynamics.ground)
     command = _sample_command(config, keys[1], curriculum, now)
     return EnvState(
         physics=state,
-        dynamics=randomize.sample(config.randomize, robot, keys[2]),
+        dynamics=dynamics,
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
         command_since=jnp.zeros((), jnp.int32),
@@ -93,6 +110,7 @@ def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         last_base_velocity=jnp.zeros(6),
         push=jnp.zeros(5),
         time=jnp.zeros((), jnp.int32),
+        disturbances=disturbances.start(config.randomize, keys[6], qpos[7:]),
     )
 
 
@@ -124,12 +142,14 @@ def step(
     noise = state.dynamics.noise
     action = _applied_action(config, action, state.last_action, noise, keys[0])
     target = jnp.asarray(robot.default_qpos[7:], jnp.float32) + config.env.action_scale * action
-    new = simulate(
-        config.physics, state.physics, target, state.dynamics, config.randomize.ground_friction
+    disturbed, target, force = disturbances.apply(
+        config.randomize, robot, state.disturbances, state.time, target, config.control_dt
     )
+    floor = config.randomize.ground_friction
+    new = simulate(config.physics, state.physics, target, state.dynamics, floor, force)
     broken = ~(jnp.all(jnp.isfinite(new.qpos)) & jnp.all(jnp.abs(new.qvel) < DIVERGED))
     new = maths.tree_where(broken, state.physics, new)
-    now = signals.read(robot, new)
+    now = signals.read(robot, new, state.dynamics.ground)
 
     command = commands.steer(config.command, state.command, now.base_euler[2])
     cycle = gait.cycle_time(config, command, curriculum.cycle_time, curriculum.v_max)
@@ -145,6 +165,7 @@ def step(
         last_last_action=state.last_action,
         last_base_velocity=now.base_velocity,
         time=time,
+        disturbances=disturbed,
     )
     state = _resample(config, state, keys[1], curriculum, now)
     state = _push(config, state, keys[2])
@@ -272,7 +293,7 @@ def observe(config: Config, state: EnvState, key: jax.Array) -> EnvState:
     """Appends the present actor and critic frames to the histories."""
     robot = physics.robot_for(config.physics)
     src = observations.Sources(
-        signals=signals.read(robot, state.physics),
+        signals=signals.read(robot, state.physics, state.dynamics.ground),
         gait=state.gait,
         command=state.command,
         dynamics=state.dynamics,

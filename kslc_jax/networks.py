@@ -142,7 +142,7 @@ class Gaussian:
 
 
 def _robot(config: Config) -> Robot:
-    return robot_lib.load(name=config.physics.robot)
+    return robot_lib.load(name=config.physics.robot, terrain=config.physics.uneven)
 
 
 def _actor(config: Config) -> nn.Module:

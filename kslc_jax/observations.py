@@ -66,8 +66,12 @@ def actor_table(robot: Robot) -> Table:
 
 @functools.lru_cache(maxsize=32)
 def critic_table(robot: Robot) -> Table:
-    """Components of the critic's frame: 25 + 4 n values for n joints, 89 for XBot-L."""
+    """Components of the critic's frame: 25 + 4 n values for n joints, 89 for XBot-L.
+
+    On uneven ground that the critic sees there are four more.
+    """
     n = robot.count
+    seen = robot.terrain is not None and robot.terrain.critic_sees
     return (
         Component("clock", 2, 1.0, 0.0, "negate"),
         Component("command", 3, (2.0, 2.0, 1.0), 0.0, "command"),
@@ -84,6 +88,9 @@ def critic_table(robot: Robot) -> Table:
         Component("base_mass", 1, 1.0 / (MASS_SCALE * robot.mass_ratio), 0.0, "keep"),
         Component("stance", 2, 1.0, 0.0, "swap"),
         Component("contact", 2, 1.0, 0.0, "swap"),
+    ) + seen * (
+        Component("foot_ground", 2, 10.0, 0.0, "swap"),
+        Component("slope", 2, 5.0, 0.0, "polar"),
     )
 
 
@@ -131,7 +138,7 @@ class Sources:
 def _values(src: Sources) -> dict[str, jax.Array]:
     """Unscaled value of every component, by name."""
     s = src.signals
-    return {
+    return s.ground | {
         "clock": src.gait.clock,
         "command": src.command.velocity,
         "joint_pos": s.joint_pos,

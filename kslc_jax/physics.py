@@ -27,9 +27,11 @@ import numpy as np
 with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a notice about an optional backend
     from mujoco import mjx
 
+from kslc_jax import ground as ground_lib
 from kslc_jax import robot as robot_lib
 from kslc_jax import runtime
 from kslc_jax.config import PhysicsConfig
+from kslc_jax.ground import Ground
 from kslc_jax.motors import SERVO_DAMPING, drive
 from kslc_jax.randomize import Dynamics, model_fields
 from kslc_jax.robot import Robot
@@ -56,6 +58,7 @@ def robot_for(config: PhysicsConfig) -> Robot:
         timestep=config.timestep,
         iterations=config.iterations,
         ls_iterations=config.ls_iterations,
+        terrain=config.uneven,
     )
 
 
@@ -102,8 +105,50 @@ def step(
     """
     fields = model_fields(robot_for(config), dynamics, ground_friction)
     fields = alter(fields) if alter else fields
+    planes = None
+    if dynamics.ground is not None:
+        if config.fidelity == "high":
+            fields = _with_height_field(robot_for(config), state, dynamics.ground, fields)
+        else:
+            planes = _planes(config, state, dynamics.ground)
     engine = _step_mujoco if resolve_engine(config) == "mujoco" else _step_mjx
-    return engine(config, state, target, dynamics, fields, force)
+    return engine(config, state, target, dynamics, fields, force, planes)
+
+
+Planes = tuple[jax.Array, jax.Array]
+"""Position [decimation, k, 3] and orientation [decimation, k, 4] of the plane below each sole
+sphere, for each physics step."""
+
+
+def _planes(config: PhysicsConfig, state: PhysicsState, ground: Ground) -> Planes:
+    """The planes that touch the ground where the sole spheres will be.
+
+    The spheres' positions are expected from their position and velocity at the start of the control
+    step. An error of theirs hardly counts: a plane that touches the ground a little beside the
+    sphere has the ground's height below it up to second order.
+    """
+    robot = robot_for(config)
+    pos, vel = (state.sensordata[robot.soles(what)].reshape(-1, 3) for what in ("pos", "vel"))
+    times = config.timestep * jnp.arange(config.decimation)[:, None, None]
+    return jax.vmap(functools.partial(ground_lib.planes, ground))(pos + times * vel)
+
+
+def _with_height_field(
+    robot: Robot, state: PhysicsState, ground: Ground, fields: dict[str, jax.Array]
+) -> dict[str, jax.Array]:
+    """Adds the window of the height field that the robot stands on to mjModel fields."""
+    pos, quat, far = ground_lib.place(ground, *state.qpos[:2])
+    floor = robot.ground_geom_ids[0]
+
+    def changed(name: str, value: jax.Array) -> jax.Array:
+        before = fields.get(name, jnp.asarray(getattr(robot.mj_model, name)))
+        return before.at[floor].set(value)
+
+    return fields | {
+        "geom_pos": changed("geom_pos", pos),
+        "geom_quat": changed("geom_quat", quat),
+        "geom_dataid": changed("geom_dataid", far.astype(int)),
+    }
 
 
 @functools.lru_cache(maxsize=8)
@@ -139,6 +184,7 @@ def _step_mjx(
     dynamics: Dynamics,
     fields: dict[str, jax.Array],
     force: jax.Array | None,
+    planes: Planes | None,
 ) -> PhysicsState:
     robot = robot_for(config)
     model = _mjx_model(config).replace(**fields)
@@ -151,13 +197,17 @@ def _step_mjx(
     if force is not None:
         data = data.replace(xfrc_applied=force)
 
-    def substep(data: mjx.Data, _: None) -> tuple[mjx.Data, jax.Array]:
+    def substep(data: mjx.Data, planes: Planes | None) -> tuple[mjx.Data, jax.Array]:
         torque, ctrl, bias = drive(robot, dynamics, data.qpos[7:], data.qvel[6:], target)
-        servos = model.actuator_biasprm.at[:, SERVO_DAMPING].set(bias)
-        return mjx.step(model.replace(actuator_biasprm=servos), data.replace(ctrl=ctrl)), torque
+        changes = {"actuator_biasprm": model.actuator_biasprm.at[:, SERVO_DAMPING].set(bias)}
+        if planes is not None:
+            ground = robot.ground_geom_ids
+            changes["geom_pos"] = model.geom_pos.at[ground].set(planes[0])
+            changes["geom_quat"] = model.geom_quat.at[ground].set(planes[1])
+        return mjx.step(model.replace(**changes), data.replace(ctrl=ctrl)), torque
 
     with jax.default_matmul_precision("highest"):
-        data, torques = jax.lax.scan(substep, data, None, length=config.decimation)
+        data, torques = jax.lax.scan(substep, data, planes, length=config.decimation)
         data = _refresh_sensors(model, data)
     new = PhysicsState(
         qpos=data.qpos,
@@ -205,6 +255,7 @@ def _step_mujoco(
     dynamics: Dynamics,
     fields: dict[str, jax.Array],
     force: jax.Array | None,
+    planes: Planes | None,
 ) -> PhysicsState:
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
     return jax.pure_callback(
@@ -215,6 +266,7 @@ def _step_mujoco(
         dynamics,
         fields,
         force,
+        planes,
         vmap_method="broadcast_all",
     )
 
@@ -226,6 +278,7 @@ def _host_step(
     dynamics: Dynamics,
     fields: dict[str, np.ndarray],
     force: np.ndarray | None = None,
+    planes: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> PhysicsState:
     """One control step of a batch in C MuJoCo; numpy in, numpy out. The result has the dtypes of
     `state`.
@@ -240,11 +293,15 @@ def _host_step(
         return x.reshape(-1, *x.shape[len(lead) :])
 
     like = state
-    state, dynamics, fields, force = jax.tree.map(rows, (state, dynamics, fields, force))
+    state, dynamics, fields, force, planes = jax.tree.map(
+        rows, (state, dynamics, fields, force, planes)
+    )
     target = rows(target)
     applied = {} if force is None else {"xfrc_applied": force}
     with _batches_lock:
-        batch = _batch(robot, len(target), config.threads, frozenset(fields | applied))
+        moved = {} if planes is None else dict(zip(("geom_pos", "geom_quat"), planes, strict=True))
+        written = frozenset(fields | applied | moved)
+        batch = _batch(robot, len(target), config.threads, written)
         for name, value in applied.items():
             batch.bind(name)[:] = value
         for name, value in fields.items():
@@ -258,6 +315,8 @@ def _host_step(
             torque, ctrl[:], servos[:, :, SERVO_DAMPING] = drive(
                 robot, dynamics, qpos[:, 7:], qvel[:, 6:], target, np
             )
+            for name, value in moved.items():
+                batch.expand(name)[:, robot.ground_geom_ids] = value[:, i]
             last = i == config.decimation - 1
             batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
         new = state.replace(

@@ -20,8 +20,9 @@ from pathlib import Path
 import tyro
 
 from kslc_jax import cli, files, runtime, sim2sim
-from kslc_jax.config import ConfigError, Fidelity, require_seed
+from kslc_jax.config import ConfigError, Fidelity, TerrainConfig, require_seed
 from kslc_jax.errors import MissingPackage
+from kslc_jax.evaluation import perturbations
 
 FPS = 50
 
@@ -58,6 +59,9 @@ class Args:
     0.0.0.0."""
     port: int = 8080
     """Port of the viewer; 0 takes any free port."""
+    ground: str | None = None
+    """Uneven ground: rough:M (random waves of up to M metres up and down), slope:DEGREES or
+    stairs:M (steps of M metres). The first 0.5 m are flat."""
     speeds: tuple[float, ...] = (2.0, 3.5)
     """Commanded forward speeds of strip and video [m/s]."""
     seconds: float = 2.0
@@ -79,6 +83,8 @@ class Args:
                 raise ConfigError(f"{path}: its name must end in {' or '.join(kinds)}")
         if self.engine != "mujoco" and self.fidelity != "high":
             raise ConfigError(f"engine: {self.engine} takes the robot at --fidelity high only")
+        if self.terrain and self.engine != "mujoco":
+            raise ConfigError(f"ground: {self.engine} has the flat floor only")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
         if self.follow and not self.live:
@@ -90,6 +96,11 @@ class Args:
     def live(self) -> bool:
         """True if the command opens the viewer."""
         return self.gait_strip is None and self.video is None
+
+    @property
+    def terrain(self) -> TerrainConfig | None:
+        """Uneven ground; None: the flat floor."""
+        return perturbations.terrain(self.ground) if self.ground else None
 
 
 # ---------------------------------------------------------------------------------------- pictures
@@ -104,7 +115,7 @@ def record(args: Args, policy, settle: float = 4.0):
 
     velocities = np.zeros((len(args.speeds), 3))
     velocities[:, 0] = args.speeds
-    engine = trials.engine(policy, args.fidelity)
+    engine = trials.engine(policy, args.fidelity, args.terrain)
     setting = trials.Setting(
         engine,
         seconds=settle + max(1.0, np.ceil(args.seconds)),
@@ -155,6 +166,13 @@ def film_writer():
     return imageio
 
 
+def ground_of(trace, steps: range, trial: int):
+    """The ground [len(steps)] of one trial of the trace; None on the flat floor."""
+    import jax
+
+    return jax.tree.map(lambda x: x[steps, trial], trace.ground)
+
+
 def film(args: Args, robot, trace, spans: Sequence[range], every: int, dt: float) -> Iterator:
     """Pictures [H, W, 3] of every `every`-th step of the spans, one speed after the other.
 
@@ -165,7 +183,9 @@ def film(args: Args, robot, trace, spans: Sequence[range], every: int, dt: float
     window = round(SPEED_SECONDS / dt)
     for i, (command, steps) in enumerate(zip(args.speeds, spans, strict=True)):
         filmed = steps[::every]
-        for step, picture in zip(filmed, render.frames(robot, trace.qpos[filmed, i]), strict=True):
+        qpos, ground = trace.qpos[filmed, i], ground_of(trace, filmed, i)
+        pictures = render.frames(robot, qpos, ground=ground)
+        for step, picture in zip(filmed, pictures, strict=True):
             speed = trace.linvel[max(0, step + 1 - window) : step + 1, i, 0].mean()
             text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
             yield caption(picture, text)
@@ -207,13 +227,16 @@ def draw(args: Args, policy) -> None:
     if args.video is not None and args.video.suffix.lower() in FILMS:
         film_writer()
     trace, start, dt = record(args, policy)
-    robot = render.shown_robot(policy)
+    robot = render.shown_robot(policy, args.terrain)
     for speed, up in zip(args.speeds, trace.alive[-1], strict=True):
         if not up:
             print(f"warning: fell at {speed:g} m/s; what is shown ends there")
     spans = [shown(trace.alive[:, i], start) for i in range(len(args.speeds))]
     if args.gait_strip is not None:
-        strips = [render.gait_strip(robot, trace.qpos[span, i], dt) for i, span in enumerate(spans)]
+        strips = [
+            render.gait_strip(robot, trace.qpos[span, i], dt, ground=ground_of(trace, span, i))
+            for i, span in enumerate(spans)
+        ]
         matplotlib.image.imsave(args.gait_strip, render.stack(strips))
         print(f"wrote {args.gait_strip}")
     if args.video is not None:
@@ -242,7 +265,7 @@ def watch(args: Args) -> None:
     if not is_local(args.host):
         print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
     with contextlib.suppress(KeyboardInterrupt):
-        how = (args.fidelity, args.host, args.port, args.seed, args.follow)
+        how = (args.fidelity, args.host, args.port, args.seed, args.follow, args.terrain)
         viewer = Viewer(args.policy, *how)
         host = "localhost" if is_local(args.host) else args.host
         print(f"viewer: http://{host}:{viewer.server.get_port()} (Ctrl-C ends it)", flush=True)

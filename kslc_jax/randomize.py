@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from kslc_jax import draws
 from kslc_jax.config import ConfigError, RandomizeConfig
+from kslc_jax.ground import Ground
 from kslc_jax.robot import Robot
 
 LIGHTEST = 0.05
@@ -28,7 +29,9 @@ class Dynamics:
     link_mass: jax.Array  # [1 + n] factor on mass and inertia, order of robot.link_body_ids
     link_com: jax.Array  # [1 + n, 3] m, shift of the centre of mass, link frame, same order
     hand_mass: jax.Array  # [] kg added to the last link of each arm
+    sole: jax.Array  # [k] m, shift of each sole sphere, see robot.sole_inward
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
+    ground: Ground | None = None  # uneven ground; None: the flat floor
 
 
 def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
@@ -45,6 +48,7 @@ def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
         link_mass=jnp.ones(links),
         link_com=jnp.zeros((links, 3)),
         hand_mass=jnp.zeros(()),
+        sole=jnp.zeros(len(robot.sole_geom_ids)),
         noise=jnp.ones(()),
     )
 
@@ -67,12 +71,13 @@ def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
       ConfigError: see `require_trunk`.
     """
     require_trunk(config, robot)
-    names = [field.name for field in dataclasses.fields(Dynamics)]
-    shapes = [getattr(nominal(robot), name).shape for name in names]
+    described = nominal(robot)
+    names = [f.name for f in dataclasses.fields(Dynamics) if hasattr(config, f.name)]
+    shapes = [getattr(described, name).shape for name in names]
     units = draws.uniforms(key, *shapes)
     ranges = [getattr(config, name) for name in names]
     values = [draws.between(unit, *bounds) for unit, bounds in zip(units, ranges, strict=True)]
-    return Dynamics(*values)
+    return described.replace(**dict(zip(names, values, strict=True)))
 
 
 def link_masses(robot: Robot, dynamics: Dynamics) -> jax.Array:
@@ -100,12 +105,14 @@ def model_fields(robot: Robot, dynamics: Dynamics, ground_friction: float) -> di
     model, trunk, links = robot.mj_model, robot.trunk_body_id, robot.link_body_ids
     contact_friction = 0.5 * (dynamics.friction + ground_friction)
     mass = link_masses(robot, dynamics)
+    spheres, shift = robot.sole_geom_ids, dynamics.sole[:, None] * robot.sole_inward
     com = jnp.asarray(model.body_ipos).at[links].add(dynamics.link_com)
     scale = mass[1:] / model.body_mass[1:]  # body 0, the world, has no mass
     return {
         "geom_friction": jnp.asarray(model.geom_friction)
         .at[robot.foot_geom_ids, 0]
         .set(contact_friction),
+        "geom_pos": jnp.asarray(model.geom_pos).at[spheres].add(shift),
         "body_mass": mass,
         "body_inertia": jnp.asarray(model.body_inertia).at[1:].multiply(scale[:, None]),
         "body_ipos": com.at[trunk].add(dynamics.base_com),

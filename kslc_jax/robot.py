@@ -9,13 +9,19 @@ One description gives two models:
 
 import functools
 from dataclasses import dataclass
+from typing import Literal
 
 import mujoco
 import numpy as np
 
-from kslc_jax.config import XBOT_L, Fidelity
-from kslc_jax.robots import anatomy, build, description
+from kslc_jax import ground
+from kslc_jax.config import XBOT_L, Fidelity, TerrainConfig
+from kslc_jax.robots import anatomy, build, description, floors
 from kslc_jax.robots.anatomy import Anatomy
+
+SOLE_RISE = 0.02
+"""Height that a sole's contact point gains per distance that it moves inwards. Half a millimetre
+decides which points of a flat foot carry the load."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +46,10 @@ class Robot:
     hand_points: np.ndarray  # [2, 3] m, centre of each hand, frame of its link
     subtree: np.ndarray  # [B, B] 1 if body `column` is in the subtree of body `row`
     foot_geom_ids: np.ndarray  # sole spheres; at high fidelity also the foot boxes
+    sole_geom_ids: np.ndarray  # [k] sole spheres
+    sole_inward: np.ndarray  # [k, 3] way of a contact point to its sole's middle, see _inward
+    terrain: TerrainConfig | None  # uneven ground; None: the flat floor
+    ground_geom_ids: np.ndarray  # what moves with uneven ground: a plane per sphere, or the floor
     torso_box_center: np.ndarray  # [3] m, base frame
     torso_box_half_size: np.ndarray  # [3] m
     total_mass: float  # kg
@@ -78,6 +88,14 @@ class Robot:
             raise KeyError(f"no sensor {name!r}; there are {', '.join(slices)}")
         return slices[name]
 
+    def soles(self, what: Literal["pos", "vel"]) -> slice:
+        """Slice of the positions, or velocities, [k, 3] of all sole spheres in `sensordata`.
+
+        Only the training model with uneven ground has these sensors.
+        """
+        first = self.sensor(f"sole_{what}_0")
+        return slice(first.start, first.start + 3 * len(self.ground_geom_ids))
+
 
 @functools.lru_cache(maxsize=32)
 def _sensor_slices(robot: Robot) -> dict[str, slice]:
@@ -95,6 +113,7 @@ def load(
     iterations: int | None = None,
     ls_iterations: int | None = None,
     name: str = XBOT_L,
+    terrain: TerrainConfig | None = None,
 ) -> Robot:
     """Compiles a robot's model and reads its facts (cached).
 
@@ -104,12 +123,13 @@ def load(
       iterations: Newton iterations of the contact solver. None: default of the fidelity.
       ls_iterations: line-search iterations. None: default of the fidelity.
       name: a shipped robot, or the path of a description.
+      terrain: uneven ground, in place of the flat floor.
 
     Raises:
       RobotError: no such robot, or one that cannot be used.
     """
     spec = build.spec(description.read(name), fidelity)
-    model = spec.compile()
+    model = _on_ground(spec, fidelity, terrain) if terrain else spec.compile()
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
@@ -127,6 +147,8 @@ def load(
     stand_height = float(model.numeric("stand_height").data[0])
     xbot = load() if name != XBOT_L else None
     at_home = _at_home(model)
+    is_sphere = model.geom_type == mujoco.mjtGeom.mjGEOM_SPHERE
+    spheres = np.flatnonzero(is_sphere & (model.geom_priority > 0))
     return Robot(
         mj_model=model,
         name=spec.modelname,
@@ -146,6 +168,10 @@ def load(
         hand_points=_hand_points(model, hands),
         subtree=_subtree(model),
         foot_geom_ids=np.flatnonzero(model.geom_priority > 0),
+        sole_geom_ids=spheres,
+        sole_inward=_inward(at_home, spheres),
+        terrain=terrain,
+        ground_geom_ids=_ground_geoms(model, fidelity) if terrain else np.array([], int),
         torso_box_center=box.pos.copy(),
         torso_box_half_size=box.size.copy(),
         total_mass=mass,
@@ -158,12 +184,54 @@ def load(
     )
 
 
+def _on_ground(spec: mujoco.MjSpec, fidelity: Fidelity, terrain: TerrainConfig) -> mujoco.MjModel:
+    """Compiles the model with uneven ground: own planes in training, else a height field."""
+    if fidelity == "train":
+        floors.own_planes(spec)
+        model = spec.compile()
+    else:
+        largest = ground.largest(terrain)
+        windows = [ground.window(largest, far) for far in (False, True)]
+        reach = float(ground.reach(largest))
+        floors.height_fields(spec, len(windows), len(windows[0]), ground.HALF, reach)
+        model = spec.compile()
+        floors.fill(model, windows)
+        model.geom(floors.FLOOR).pos = [0.0, 0.0, -reach]
+    model.geom_sameframe[_ground_geoms(model, fidelity)] = 0  # use geom_pos and geom_quat
+    return model
+
+
+def _ground_geoms(model: mujoco.MjModel, fidelity: Fidelity) -> np.ndarray:
+    """Geoms of the ground, see `Robot.ground_geom_ids`."""
+    if fidelity == "high":
+        return np.array([model.geom(floors.FLOOR).id])
+    kinds, of_world = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE, model.geom_bodyid == 0
+    planes = np.flatnonzero(kinds & of_world)
+    return planes[planes != model.geom(floors.FLOOR).id]
+
+
 def _at_home(model: mujoco.MjModel) -> mujoco.MjData:
     """The robot at rest in its home pose."""
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.keyframe("home").id)
     mujoco.mj_forward(model, data)
     return data
+
+
+def _inward(at_home: mujoco.MjData, spheres: np.ndarray) -> np.ndarray:
+    """[k, 3] direction in which each sole sphere moves when its sole gets smaller, link frame.
+
+    It leads to the middle of the foot's spheres. It has the length 1 along the ground, and rises by
+    `SOLE_RISE`.
+    """
+    feet, ways = at_home.model.geom_bodyid[spheres], np.zeros((len(spheres), 3))
+    for foot in np.unique(feet):
+        points = at_home.geom_xpos[spheres[feet == foot]]
+        offset = (points.mean(axis=0) - points)[:, :2]
+        along = offset / np.linalg.norm(offset, axis=1, keepdims=True)
+        rising = np.column_stack([along, np.full(len(along), SOLE_RISE)])
+        ways[feet == foot] = rising @ at_home.xmat[foot].reshape(3, 3)
+    return ways
 
 
 def _apart(data: mujoco.MjData, sensor: str) -> float:

@@ -3,9 +3,10 @@
 Runs trials of the deterministic policy over commanded forward speeds and seeds. The simulator is
 full C MuJoCo (1 ms, PD torque at every step, elliptic cones, converged solver, self-collision,
 joint friction). With --engine drake it is Drake, which has another contact model and solver. Prints
-the table of kslc_jax.evaluate. The option --perturb repeats the trials with a changed robot or
-ground. With --schedule the commands change during a trial, and the table shows the robots'
-reaction. docs/sim2sim.md explains both tables. A * marks conditions beyond the policy's training.
+the table of kslc_jax.evaluate. The options --perturb and --ground repeat the trials with a changed
+robot and on uneven ground. With --schedule the commands change during a trial, and the table shows
+the robots' reaction. docs/sim2sim.md explains both tables. A * marks conditions beyond the policy's
+training.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
@@ -16,6 +17,7 @@ Examples:
   python -m kslc_jax.sim2sim runs/laptop-seed0 --speeds -0.3 0 0.5 --turn 1
   python -m kslc_jax.sim2sim runs/laptop-seed0 --schedule stop random --seeds 16 --json out.json
   python -m kslc_jax.sim2sim runs/laptop-seed0 --schedule my.json --punch 300 --heading 0 3.14159
+  python -m kslc_jax.sim2sim runs/laptop-seed0 --ground rough:0.05 slope:10 stairs:0.1 --speeds 1 2
   python -m kslc_jax.sim2sim runs/laptop-seed0 --engine drake --seconds 20 --seeds 2
 
 Your own schedule is a JSON list; it repeats after its end. vy, yaw_rate and heading are optional. A
@@ -42,7 +44,7 @@ from kslc_jax import cli, evaluate, files
 from kslc_jax.config import ConfigError, PhysicsConfig, require_seed
 from kslc_jax.errors import MissingPackage
 from kslc_jax.evaluation import tables
-from kslc_jax.evaluation.perturbations import ALL, changes, settings
+from kslc_jax.evaluation.perturbations import ALL, changes, settings, terrain
 
 if TYPE_CHECKING:
     from kslc_jax.evaluation.trials import Setting
@@ -52,6 +54,10 @@ Engine = Literal["mujoco", "drake"]
 
 MOST_LATENCY = 50
 """Largest delay of the actions [control steps]."""
+
+
+MUJOCO_ONLY = ("variation", "terrain")
+"""Changes of `perturbations.changes` that Drake does not have."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +97,10 @@ class Args:
     """Force [N] for 0.08 s at a random link in a random direction every 4 s."""
     hold_arms: bool = False
     """The arms follow random targets, at most 0.3 rad/s fast, in place of the policy's actions."""
+    ground: tuple[str, ...] = ()
+    """Repeat the trials on each of these, as height fields: rough:M (random waves of up to M metres
+    up and down), slope:DEGREES (a plane), stairs:M (steps of M metres). Each robot draws the
+    direction. The first 0.5 m are flat."""
     perturb: tuple[str, ...] = ()
     """Repeat the trials with each of these: friction=MU, payload=KG on the base, com=M (shift of
     the base's centre of mass forwards, to the left and up), push=M/S (largest push along x and y,
@@ -117,10 +127,12 @@ class Args:
             raise ConfigError("punch must be a force in newtons, not negative")
         if self.top is not None and not (math.isfinite(self.top) and self.top > 0):
             raise ConfigError("top must be a positive speed")
+        for ground in self.ground:
+            terrain(ground)
         for name in self.conditions:
             made = changes(name)
-            if self.engine == "drake" and (self.punch or "variation" in made):
-                raise ConfigError("punches, hands, sole and joints need --engine mujoco")
+            if self.engine == "drake" and (self.punch or not made.keys().isdisjoint(MUJOCO_ONLY)):
+                raise ConfigError("punches, hands, sole, joints and ground need --engine mujoco")
 
     @property
     def conditions(self) -> tuple[str, ...]:
@@ -128,7 +140,7 @@ class Args:
         every = [c for c in ALL if self.engine == "mujoco" or "variation" not in changes(c)]
         asked = (c for name in self.perturb for c in (every if name == "all" else (name,)))
         turned = (f"heading={yaw:g}" for yaw in self.heading[1:])
-        return tuple(dict.fromkeys(("nominal", *turned, *asked)))
+        return tuple(dict.fromkeys(("nominal", *turned, *self.ground, *asked)))
 
 
 def simulator(engine: Engine):
@@ -150,17 +162,21 @@ def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
     """The setting of the trials under one condition."""
     from kslc_jax.evaluation import trials
 
+    made = changes(condition)
+    if "terrain" in made:
+        physics = dataclasses.replace(physics, terrain=made.pop("terrain"))
     plain = trials.Setting(
         physics,
         seconds=args.seconds,
         noise=args.noise,
         latency=args.latency,
-        punch=args.punch,
-        hold_arms=args.hold_arms,
         heading=args.heading[0],
         simulate=simulator(args.engine),
     )
-    return dataclasses.replace(plain, **settings(changes(condition), plain.randomize))
+    disturbed = dataclasses.replace(
+        plain.randomize, punch=(args.punch, args.punch), held_arms=float(args.hold_arms)
+    )
+    return dataclasses.replace(plain, **settings(made, disturbed))
 
 
 CONDITIONS = (

@@ -115,6 +115,7 @@ def test_what_the_paper_leaves_to_humanoid_gym():
     assert r.kp == r.kd == r.motor_strength == (1.0, 1.0)
     assert r.base_com == r.joint_friction == r.link_com == r.hand_mass == (0.0, 0.0)
     assert r.link_mass == (1.0, 1.0)
+    assert r.sole == r.punch == (0.0, 0.0) and r.held_arms == 0.0
     w = PAPER.rewards
     assert (w.tracking_sigma, w.base_height_target, w.clearance_target) == (5.0, 0.89, 0.06)
     assert w.max_contact_force == 700.0
@@ -227,6 +228,8 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "randomize.link_mass": (0.9, 1.1),
         "randomize.link_com": (-0.01, 0.01),
         "randomize.hand_mass": (0.0, 0.5),
+        "randomize.sole": (0.0, 0.02),
+        "randomize.punch": (0.0, 200.0),
         "randomize.noise": (0.0, 1.0),
         "rewards.momentum_scale": 2.0,
         "rewards.base_height_kernel": 30.0,

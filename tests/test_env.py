@@ -257,7 +257,7 @@ def test_the_engine_steps_the_robot_of_the_episode(setting):
     config, reset, _ = setting
     state, given = reset(jax.random.key(0)), []
 
-    def simulate(physics_config, state, target, dynamics, ground_friction):
+    def simulate(physics_config, state, target, dynamics, ground_friction, force):
         given.append((dynamics, ground_friction))
         return state
 

@@ -198,7 +198,7 @@ def momentum(robot, state):
 def runs():
     """100 control steps of both engines from standing, with small sine targets: 8 environments with
     randomised dynamics."""
-    config = RandomizeConfig(kp=(0.9, 1.1), kd=(0.9, 1.1), base_com=(-0.02, 0.02))
+    config = RandomizeConfig(kp=(0.9, 1.1), kd=(0.9, 1.1), base_com=(-0.02, 0.02), sole=(0.0, 0.02))
     keys = jax.random.split(jax.random.key(0), 8)
     dyn = jax.vmap(lambda key: randomize.sample(config, XBOT, key))(keys)
     out = {}
@@ -353,6 +353,17 @@ def test_link_randomisation_matches_a_recompiled_model(xbot):
     np.testing.assert_allclose(fields["body_ipos"], model.body_ipos, atol=1e-7)
 
 
+def test_a_smaller_sole_is_one_whose_contact_points_move_to_its_middle(xbot):
+    """Its points lie 2 cm nearer to the middle along the diagonal, and 0.4 mm higher."""
+    drawn = randomize.nominal(XBOT).replace(sole=jnp.full(8, 0.02))
+    points = randomize.model_fields(xbot, drawn, GROUND)["geom_pos"][xbot.sole_geom_ids]
+    before = xbot.mj_model.geom_pos[xbot.sole_geom_ids]
+    middle = np.repeat([before[:4].mean(0), before[4:].mean(0)], 4, axis=0)
+    nearer = [np.linalg.norm((p - middle)[:, :2], axis=1) for p in (before, points)]
+    np.testing.assert_allclose(nearer[0] - nearer[1], 0.02, atol=1e-5)
+    np.testing.assert_allclose(points[:, 2] - before[:, 2], 0.0004, atol=1e-6)
+
+
 def test_divergence_shows_as_nan_not_as_a_reset():
     """C MuJoCo would reset a diverged simulation silently, and the training could not mask it."""
     step = make_step("mujoco")
@@ -378,7 +389,7 @@ def test_every_range_is_filled_independently():
         **{"friction": (0.1, 2.0), "base_mass": (-5.0, 5.0), "base_com": (-0.02, 0.03)},
         **{"kp": (0.8, 1.1), "kd": (0.7, 1.3), "motor_strength": (0.9, 1.0)},
         **{"joint_friction": (0.0, 1.0), "noise": (0.0, 0.5), "hand_mass": (0.0, 0.5)},
-        **{"link_mass": (0.9, 1.1), "link_com": (-0.01, 0.01)},
+        **{"link_mass": (0.9, 1.1), "link_com": (-0.01, 0.01), "sole": (0.0, 0.02)},
     }
     draw = jax.vmap(lambda key: randomize.sample(RandomizeConfig(**ranges), XBOT, key))
     drawn, columns = draw(jax.random.split(jax.random.key(0), 2000)), []

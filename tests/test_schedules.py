@@ -241,8 +241,9 @@ def test_what_lies_beyond_the_training_is_named(still):
     assert robots(base_mass=(5.0, 5.0)) == [] and robots(base_mass=(8.0, 8.0)) == ["base_mass"]
     assert robots(friction=(0.3, 0.3), ground_friction=0.3) == ["friction"]
     assert robots(push_seconds=4.0, push_velocity=0.5) == ["push"]
-    assert reasons(latency=1, punch=300.0) == ["latency", "punch"]
-    assert reasons(hold_arms=True, imu_offset=(0.1, 0.0)) == ["imu", "arms"]
+    assert robots(punch=(300.0, 300.0), held_arms=1.0) == ["punch", "arms"]
+    assert robots(punch=(100.0, 100.0)) == []
+    assert reasons(latency=1, imu_offset=(0.1, 0.0)) == ["latency", "imu"]
     stop = schedules.named("stop", CONFIG, v_max)
     jitter = schedules.named("jitter", CONFIG, v_max)
     assert reasons(schedule=stop) == [] and reasons(schedule=jitter) == ["pace"]

@@ -12,6 +12,8 @@ from kslc_jax.config.options import options
 from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
 from kslc_jax.config.schema import (
     COUNTER,
+    GROUNDS,
+    MOST_INSET,
     XBOT_L,
     CommandConfig,
     Config,
@@ -29,6 +31,7 @@ from kslc_jax.config.schema import (
     RewardConfig,
     RewardWeights,
     RunConfig,
+    TerrainConfig,
     require_seed,
 )
 from kslc_jax.config.storage import (
@@ -43,6 +46,8 @@ from kslc_jax.config.storage import (
 __all__ = [
     "ABLATIONS",
     "COUNTER",
+    "GROUNDS",
+    "MOST_INSET",
     "PRESETS",
     "ROBOT_FOLDER",
     "SCHEMA_VERSION",
@@ -63,6 +68,7 @@ __all__ = [
     "RewardConfig",
     "RewardWeights",
     "RunConfig",
+    "TerrainConfig",
     "find_robot",
     "from_dict",
     "is_description",

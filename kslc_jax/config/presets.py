@@ -89,6 +89,8 @@ _LAPTOP = _override(
         "link_mass": (0.9, 1.1),
         "link_com": (-0.01, 0.01),
         "hand_mass": (0.0, 0.5),
+        "sole": (0.0, 0.02),
+        "punch": (0.0, 200.0),
         "noise": (0.0, 1.0),
     },
     rewards={

@@ -53,6 +53,53 @@ def _check_range(name: str, value: Range) -> None:
 
 
 @dataclass(frozen=True)
+class TerrainConfig:
+    """Uneven ground. All sizes 0, the default: the flat floor.
+
+    Every episode draws one kind among those whose size is not 0, its size, and its direction
+    (kslc_jax/ground.py)."""
+
+    rough: float = 0.0
+    """Largest height of random waves [m], up and down."""
+    slope: float = 0.0
+    """Largest inclination of a plane [degrees]."""
+    stairs: float = 0.0
+    """Largest height of a stair's step [m]."""
+    flat: float = 0.2
+    """Share of episodes on flat ground."""
+    least: float = 0.0
+    """Smallest size that an episode draws, as a share of the largest one. 1: always the largest."""
+    full_from: float = 0.0
+    """Sizes grow with the curriculum's v_max, and have their full range from this v_max [m/s] on.
+    0: from the start."""
+    critic_sees: bool = True
+    """True: the critic's frame has the ground below the feet and its slope. The actor's never has.
+    False: both networks have the shapes of a training on the flat floor (--start-from)."""
+
+    def __post_init__(self):
+        require(0 <= self.rough <= 0.5, "physics.terrain.rough must lie in [0, 0.5] m")
+        require(0 <= self.slope <= 30, "physics.terrain.slope must lie in [0, 30] degrees")
+        require(0 <= self.stairs <= 0.3, "physics.terrain.stairs must lie in [0, 0.3] m")
+        require(0 <= self.flat < 1, "physics.terrain.flat must lie in [0, 1)")
+        require(0 <= self.least <= 1, "physics.terrain.least must lie in [0, 1]")
+        require(self.full_from >= 0, "physics.terrain.full_from must not be negative")
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Names of the kinds of uneven ground whose size is not 0."""
+        return tuple(kind for kind in GROUNDS if getattr(self, kind))
+
+    @property
+    def fixed(self) -> bool:
+        """True if all episodes have ground of one kind and one size."""
+        return len(self.kinds) == 1 and self.flat == 0 and self.least == 1 and not self.full_from
+
+
+GROUNDS = ("rough", "slope", "stairs")
+"""Kinds of uneven ground: fields of `TerrainConfig`."""
+
+
+@dataclass(frozen=True)
 class PhysicsConfig:
     """Simulation of one control step."""
 
@@ -74,6 +121,7 @@ class PhysicsConfig:
     threads: int = 0
     """CPU threads of the mujoco engine; 0: all CPUs that this process may use. Does not change
     results."""
+    terrain: TerrainConfig = TerrainConfig()
 
     def __post_init__(self):
         require(self.timestep > 0, "physics.timestep must be positive")
@@ -86,6 +134,11 @@ class PhysicsConfig:
     def control_dt(self) -> float:
         """Seconds per control step."""
         return self.timestep * self.decimation
+
+    @property
+    def uneven(self) -> TerrainConfig | None:
+        """The terrain; None if it is the flat floor."""
+        return self.terrain if self.terrain.kinds else None
 
 
 @dataclass(frozen=True)
@@ -103,6 +156,11 @@ class HighFidelity(PhysicsConfig):
     def __post_init__(self):
         super().__post_init__()
         require(self.engine == "mujoco", "high fidelity needs physics.engine mujoco")
+        require(
+            self.terrain.fixed or not self.terrain.kinds,
+            "high fidelity has one height field: physics.terrain needs one kind, flat 0, least 1, "
+            "full_from 0",
+        )
 
 
 @dataclass(frozen=True)
@@ -252,6 +310,10 @@ class GaitConfig:
         require(self.full_speed > 0, "gait.full_speed must be positive")
 
 
+MOST_INSET = 0.04
+"""Largest distance [m] by which the edge of a sole moves inwards. It leaves the sole some area."""
+
+
 @dataclass(frozen=True)
 class RandomizeConfig:
     """Domain randomisation, sampled at every reset. Two equal bounds mean a constant."""
@@ -278,6 +340,9 @@ class RandomizeConfig:
     """Shift of each link's centre of mass, per axis [m]."""
     hand_mass: Range = (0.0, 0.0)
     """Mass added to the last link of each arm, at its centre of mass [kg]."""
+    sole: Range = (0.0, 0.0)
+    """Distance [m] by which each contact point of a sole lies nearer to the sole's middle. It is
+    then also a little higher, so that two to four points of a flat foot carry the load."""
     noise: Range = (1.0, 1.0)
     """Factor on observation noise, action noise and action delay of an episode."""
     push_seconds: float = 4.0
@@ -289,6 +354,12 @@ class RandomizeConfig:
     push_adds: bool = True
     """True: a push is added to the base's velocity. False: it replaces the velocity (HG). At
     3.5 m/s a replaced velocity is like a wall, not like a push."""
+    punch: Range = (0.0, 0.0)
+    """Size [N] of a force that acts for 0.08 s at a random link in a random direction, every 4 s.
+    0: no punches."""
+    held_arms: float = 0.0
+    """Share of the episodes in which the arms follow slow random targets in place of the actions,
+    as if somebody else moved them."""
 
     def __post_init__(self):
         for f in dataclasses.fields(self):
@@ -303,9 +374,13 @@ class RandomizeConfig:
             "joint_friction",
             "noise",
             "hand_mass",
+            "sole",
+            "punch",
         ):
             require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
         require(self.link_mass[0] > 0, "randomize.link_mass must be positive")
+        require(self.sole[1] <= MOST_INSET, f"randomize.sole must be at most {MOST_INSET} m")
+        require(0 <= self.held_arms <= 1, "randomize.held_arms must lie in [0, 1]")
 
 
 @dataclass(frozen=True)

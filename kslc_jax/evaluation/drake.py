@@ -314,10 +314,11 @@ def step(
     target: jax.Array,
     dynamics: Dynamics,
     ground_friction: float,
+    force: None = None,
 ) -> PhysicsState:
     """Advances one environment by one control step, as `physics.step` does, but in Drake.
 
-    Under vmap it steps one environment after the other.
+    Under vmap it steps one environment after the other. It knows no forces on links.
     """
     fields = model_fields(physics.robot_for(config), dynamics, ground_friction)
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)

@@ -6,6 +6,7 @@ variation, effort, strides, symmetry and momentum leave such trials out. `summar
 metrics. Angular momenta are about the whole-body centre of mass (paper, Eq. 3).
 """
 
+import jax
 import mujoco
 import numpy as np
 from scipy.special import stdtrit
@@ -34,8 +35,7 @@ def _steady(trace: Trace, dt: float) -> Trace:
     """The part of the trace after `SETTLE`, of the trials without a fall."""
     start = round(SETTLE / dt)
     upright = trace.alive[-1]
-    fields = {n: getattr(trace, n)[start:, upright] for n in trace.__dataclass_fields__}
-    return Trace(**fields)
+    return jax.tree.map(lambda x: x[start:, upright], trace)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

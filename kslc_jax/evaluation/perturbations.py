@@ -1,6 +1,7 @@
 """Perturbations by name (friction=0.3, payload=5, links=0.1, ...) and the settings they change.
 
-Imports no JAX, so that a command checks its arguments quickly.
+Also uneven ground by name (rough:0.05, slope:10, ...). Imports no JAX, so that a command checks its
+arguments quickly.
 """
 
 import dataclasses
@@ -9,10 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from kslc_jax.config import ConfigError, RandomizeConfig
-
-MOST_INSET = 0.04
-"""Largest `Variation.sole` [m]. It leaves the soles some area."""
+from kslc_jax.config import GROUNDS, MOST_INSET, ConfigError, RandomizeConfig, TerrainConfig
 
 
 @dataclass(frozen=True)
@@ -70,17 +68,36 @@ ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
 """Names of the changes that belong in `trials.Setting.randomize`."""
 
 
+def terrain(text: str) -> TerrainConfig:
+    """Ground of one kind and size, from a text such as 'rough:0.05'. ConfigError if it is wrong."""
+    kind, _, size = text.partition(":")
+    try:
+        if kind not in GROUNDS or not 0 < float(size) < math.inf:
+            raise ValueError
+        sizes: dict[str, Any] = {kind: float(size)}
+        return TerrainConfig(**sizes, flat=0.0, least=1.0)
+    except ConfigError as error:
+        raise ConfigError(f"ground: {text}: {error}") from None
+    except ValueError:
+        raise ConfigError(
+            f"ground: cannot read {text!r} (known: rough:METRES, slope:DEGREES, stairs:METRES)"
+        ) from None
+
+
 def changes(condition: str) -> dict[str, Any]:
     """The fields that a condition changes, with their values.
 
     Args:
-      condition: 'nominal', or a perturbation such as 'payload=5'.
+      condition: 'nominal', a perturbation such as 'payload=5', or a ground such as 'rough:0.05';
+        `terrain` is a field of `trials.Setting.physics`.
 
     Raises:
       ConfigError: the condition is unknown, or its value is out of range.
     """
     if condition == "nominal":
         return {}
+    if ":" in condition:
+        return {"terrain": terrain(condition)}
     name, _, value = condition.partition("=")
     try:
         if not math.isfinite(float(value)):

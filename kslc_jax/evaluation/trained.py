@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
-from kslc_jax.config import Config, RandomizeConfig
+from kslc_jax.config import GROUNDS, Config, RandomizeConfig, TerrainConfig
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Schedule
 from kslc_jax.evaluation.trials import Setting
@@ -34,9 +34,10 @@ def beyond(
     if schedule and _pace(schedule) < shortest - TOLERANCE:
         reasons.append("pace")
     reasons += _robot_reasons(trained.randomize, setting.randomize)
+    reasons += _ground_reasons(trained.physics.terrain, setting.physics.terrain)
     if setting.latency > trained.env.action_delay:
         reasons.append("latency")
-    others = {"imu": any(setting.imu_offset), "punch": setting.punch, "arms": setting.hold_arms}
+    others: dict[str, bool | float] = {"imu": any(setting.imu_offset)}
     for field in dataclasses.fields(Variation):
         others[field.name] = getattr(setting.variation, field.name)
     reasons += [name for name, value in others.items() if value]
@@ -81,4 +82,11 @@ def _robot_reasons(trained: RandomizeConfig, tried: RandomizeConfig) -> list[str
         if mine[0] < theirs[0] - TOLERANCE or mine[1] > theirs[1] + TOLERANCE
     ]
     pushed = tried.push_seconds > 0 and tried.push_velocity > trained.push_velocity
-    return reasons + ["push"] * pushed
+    punched = tried.punch[1] > trained.punch[1]
+    held = tried.held_arms > 0 and trained.held_arms == 0
+    return reasons + ["push"] * pushed + ["punch"] * punched + ["arms"] * held
+
+
+def _ground_reasons(trained: TerrainConfig, tried: TerrainConfig) -> list[str]:
+    larger = (getattr(tried, kind) > getattr(trained, kind) + TOLERANCE for kind in GROUNDS)
+    return ["ground"] * any(larger)

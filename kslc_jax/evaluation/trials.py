@@ -15,12 +15,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax import commands, env, gait, maths, networks, observations, physics, randomize, signals
-from kslc_jax.config import Config, Fidelity, HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.config import (
+    Config,
+    Fidelity,
+    HighFidelity,
+    PhysicsConfig,
+    RandomizeConfig,
+    TerrainConfig,
+)
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.evaluation import disturbances, schedules, variation
+from kslc_jax.evaluation import schedules, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Leg, Schedule
 from kslc_jax.evaluation.variation import Body
+from kslc_jax.ground import Ground
 from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
 
@@ -60,10 +68,6 @@ class Setting:
     """Commands that change; None: one constant command per robot."""
     heading: float = 0.0
     """Heading [rad] at the start. It is also the commanded heading until a schedule changes it."""
-    punch: float = 0.0
-    """Force [N] of the punches, see `disturbances.punch`; 0: no punches."""
-    hold_arms: bool = False
-    """True: the arms follow random targets in place of the policy's actions."""
     variation: Variation = AS_DESCRIBED
     """Differences between the robots beyond those of `randomize`."""
 
@@ -81,10 +85,11 @@ class Trace:
     joint_vel: jax.Array  # [n] rad/s
     torque: jax.Array  # [n] N m
     contact: jax.Array  # [2] bool, left and right foot
-    foot_height: jax.Array  # [2] m, ankle-roll link
+    foot_height: jax.Array  # [2] m, ankle-roll link above the ground
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
     command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s] during the step
     leg: jax.Array  # int, number of the schedule's leg
+    ground: Ground | None = None  # uneven ground; None: the flat floor
 
 
 @flax.struct.dataclass
@@ -95,16 +100,21 @@ class Trial:
     alive: jax.Array  # [] bool
     queue: jax.Array  # [latency, n] delayed actions, the next one first
     leg: Leg
-    arms: jax.Array  # [n] rad, joint targets of held arms
     body: Body
     key: jax.Array  # random key of this robot
-    steps: jax.Array  # [] int, control steps done
 
 
-def engine(policy: Policy, fidelity: Fidelity) -> PhysicsConfig:
-    """The physics config: that of the policy's training ("train"), or high fidelity ("high")."""
-    trained = policy.config.physics
-    return HighFidelity(robot=trained.robot) if fidelity == "high" else trained
+def engine(
+    policy: Policy, fidelity: Fidelity, terrain: TerrainConfig | None = None
+) -> PhysicsConfig:
+    """The physics config: that of the policy's training ("train"), or high fidelity ("high").
+
+    Without `terrain` the floor is flat.
+    """
+    trained, terrain = policy.config.physics, terrain or TerrainConfig()
+    if fidelity == "high":
+        return HighFidelity(robot=trained.robot, terrain=terrain)
+    return dataclasses.replace(trained, terrain=terrain)
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
@@ -229,10 +239,8 @@ def _start(
         alive=jnp.ones((), bool),
         queue=jnp.zeros((setting.latency, len(state.last_action))),
         leg=leg,
-        arms=state.physics.qpos[7:],
         body=variation.sample(setting.variation, robot, key_body),
         key=own,
-        steps=jnp.zeros((), jnp.int32),
     )
 
 
@@ -253,49 +261,35 @@ def _advance(
 ) -> tuple[Trial, Trace]:
     """One control step of one robot."""
     robot, dt = physics.robot_for(config.physics), config.control_dt
-    leg, arms = trial.leg, trial.arms
+    leg = trial.leg
     if setting.schedule:
         qpos = trial.env.physics.qpos
         yaw = maths.quat_to_euler(qpos[3:7])[2]
         leg = schedules.update(setting.schedule, config.command, leg, trial.key, yaw, qpos[:2], dt)
-    if setting.hold_arms:
-        arms = disturbances.walk_arms(robot, arms, trial.key, trial.steps, dt)
     state = with_command(config, trial.env, leg.velocity, leg.heading)
     action = policy.act_on(state.history + _frame_error(setting, robot))
     queue = jnp.concatenate([trial.queue, action[None]])
-    simulate = _simulator(config, setting, robot, trial.replace(arms=arms), key)
+    simulate = _simulator(setting, robot, trial.body, key)
     after, outcome = step(config, state, queue[0], key, policy.curriculum, simulate=simulate)
     trial = trial.replace(
         env=after,
         alive=trial.alive & ~outcome.terminated,
         queue=queue[1:],
         leg=leg,
-        arms=arms,
-        steps=trial.steps + 1,
     )
     mass = randomize.total_mass(robot, after.dynamics)
     mass += len(robot.hand_body_ids) * setting.variation.hands
     return trial, _record(robot, trial, state.command.velocity, mass)
 
 
-def _simulator(config: Config, setting: Setting, robot: Robot, trial: Trial, key: jax.Array):
-    """The engine with the setting's disturbances. It has the signature of `physics.step`."""
-    engine, more = setting.simulate or physics.step, {}
-    if setting.punch:
-        more["force"] = disturbances.punch(
-            robot, setting.punch, trial.key, trial.steps, config.control_dt
-        )
-    if setting.variation != AS_DESCRIBED:
-        key_body = jax.random.fold_in(key, 1)
-        more["alter"] = functools.partial(
-            variation.alter, setting.variation, robot, trial.body, key_body
-        )
-
-    def simulate(config: PhysicsConfig, state: physics.PhysicsState, target: jax.Array, *rest):
-        target = jnp.where(robot.is_arm & setting.hold_arms, trial.arms, target)
-        return engine(config, state, target, *rest, **more)
-
-    return simulate
+def _simulator(setting: Setting, robot: Robot, body: Body, key: jax.Array):
+    """The engine with the setting's variation. It has the signature of `physics.step`."""
+    engine = setting.simulate or physics.step
+    if setting.variation == AS_DESCRIBED:
+        return engine
+    key_body = jax.random.fold_in(key, 1)
+    alter = functools.partial(variation.alter, setting.variation, robot, body, key_body)
+    return functools.partial(engine, alter=alter)
 
 
 def _frame_error(setting: Setting, robot: Robot) -> np.ndarray:
@@ -308,8 +302,8 @@ def _frame_error(setting: Setting, robot: Robot) -> np.ndarray:
 
 
 def _record(robot: Robot, trial: Trial, command: jax.Array, mass: jax.Array) -> Trace:
-    state = trial.env.physics
-    now = signals.read(robot, state)
+    state, ground = trial.env.physics, trial.env.dynamics.ground
+    now = signals.read(robot, state, ground)
     return Trace(
         alive=trial.alive,
         mass=mass,
@@ -324,6 +318,7 @@ def _record(robot: Robot, trial: Trial, command: jax.Array, mass: jax.Array) -> 
         angular_momentum=now.angular_momentum,
         command=command,
         leg=trial.leg.number,
+        ground=ground,
     )
 
 

@@ -65,7 +65,7 @@ def alter(variation: Variation, robot: Robot, body: Body, key: jax.Array, fields
             "dof_damping": jnp.asarray(model.dof_damping).at[6:].add(body.damping),
         }
     if variation.sole:
-        fields = fields | _soles(variation.sole, robot, key)
+        fields = fields | _soles(variation.sole, robot, key, fields)
     return fields
 
 
@@ -105,7 +105,7 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
     return out
 
 
-def _soles(inset: float, robot: Robot, key: jax.Array) -> Fields:
+def _soles(inset: float, robot: Robot, key: jax.Array, fields: Fields) -> Fields:
     """Random foot boxes that lie inside the described ones and are tilted by up to `TILT`."""
     model = robot.mj_model
     feet = np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) for foot in FEET])
@@ -118,7 +118,7 @@ def _soles(inset: float, robot: Robot, key: jax.Array) -> Fields:
     quat = jnp.concatenate([jnp.ones((2, 1)), 0.5 * tilt, jnp.zeros((2, 1))], axis=1)
     return {
         "geom_size": jnp.asarray(model.geom_size).at[feet, :2].add(-shrink),
-        "geom_pos": jnp.asarray(model.geom_pos).at[feet, :2].add(shift),
+        "geom_pos": fields["geom_pos"].at[feet, :2].add(shift),
         "geom_quat": jnp.asarray(model.geom_quat).at[feet].set(quat),
         "geom_sameframe": jnp.asarray(model.geom_sameframe).at[feet].set(0),  # use geom_quat
     }

@@ -19,10 +19,12 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from kslc_jax import ground as ground_lib
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
-from kslc_jax.config import ConfigError, Fidelity
+from kslc_jax.config import ConfigError, Fidelity, TerrainConfig
 from kslc_jax.evaluation import trials
+from kslc_jax.ground import Ground
 from kslc_jax.policy import Policy, load_policy
 from kslc_jax.robot import Robot
 from kslc_jax.viewer import panel, render
@@ -44,6 +46,11 @@ SPEED_SECONDS = 1.0
 
 SHOWN_GROUP = 2
 """Highest geom group that is drawn, as in MuJoCo's own viewer."""
+
+GROUND_COLOR = (214, 218, 224)
+
+COARSER = 2
+"""Distance of the points of the drawn ground by that of the height field."""
 
 SLOW = 0.95
 """Share of the chosen playback speed. At a lower speed the page says "too slow"."""
@@ -89,6 +96,20 @@ def mesh_data(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]
     return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
 
 
+def ground_mesh(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3, m] and faces [F, 3] of a height field, with every `COARSER`th point."""
+    rows, columns = model.hfield_nrow[field], model.hfield_ncol[field]
+    first, (along, across, top, _) = model.hfield_adr[field], model.hfield_size[field]
+    data = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
+    heights = top * data[::COARSER, ::COARSER]
+    y, x = (np.linspace(-h, h, n) for h, n in zip((across, along), heights.shape, strict=True))
+    vertices = np.stack([*np.meshgrid(x, y), heights], -1).reshape(-1, 3)
+    index = np.arange(heights.size).reshape(heights.shape)
+    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
+    faces = np.stack([a, b, d, a, d, c], -1).reshape(-1, 3)
+    return vertices.astype(np.float32), faces.astype(np.uint32)
+
+
 class Figure:
     """The robot and the floor in a viser scene.
 
@@ -112,12 +133,16 @@ class Figure:
         server.initial_camera.fov = np.radians(FOV)
         self._world = scene.add_frame("/world", show_axes=False)
         self._bodies = {}
+        self._windows: list[viser.MeshHandle] = []
         for geom in range(model.ngeom):
             body = int(model.geom_bodyid[geom])
             if model.geom_group[geom] > SHOWN_GROUP:
                 continue
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
                 self._add_floor(scene)
+                continue
+            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_HFIELD:
+                self._add_ground(scene)
                 continue
             name = f"/world/{model.body(body).name}"
             if body not in self._bodies:
@@ -140,14 +165,34 @@ class Figure:
             shadow_opacity=0.3,
         )
 
+    def _add_ground(self, scene: viser.SceneApi) -> None:
+        """Adds the windows of the height field; `show` makes one of them visible."""
+        self._windows = [
+            scene.add_mesh_simple(
+                f"/world/ground_{i}",
+                *ground_mesh(self._model, i),
+                color=GROUND_COLOR,
+                visible=False,
+            )
+            for i in range(self._model.nhfield)
+        ]
+
+    def _put_ground(self, ground: Ground, x: float, y: float) -> float:
+        """Shows the ground around x and y [m]; returns its height there [m]."""
+        pos, quat, far = ground_lib.place(ground, x, y, np)
+        for i, window in enumerate(self._windows):
+            window.visible, window.position, window.wxyz = i == int(far), pos, quat
+        return float(ground_lib.height(ground, x, y, np))
+
     def show(self, view: View) -> None:
         """Moves every body to its pose in the view."""
         qpos = np.asarray(view.qpos)
         self._data.qpos[:] = qpos
         mujoco.mj_kinematics(self._model, self._data)
         with self._server.atomic():
+            floor = self._put_ground(view.ground, qpos[0], qpos[1]) if view.ground else 0.0
             if self.follow:
-                self._world.position = (-qpos[0], -qpos[1], 0.0)
+                self._world.position = (-qpos[0], -qpos[1], -floor)
             for body, frame in self._bodies.items():
                 frame.position = self._data.xpos[body]
                 frame.wxyz = self._data.xquat[body]
@@ -197,12 +242,14 @@ class Viewer:
         port: int = 8080,
         seed: int = 0,
         follow: bool = False,
+        terrain: TerrainConfig | None = None,
     ):
         """Loads the policy and serves the page. The robot does not move before `run`.
 
         With `follow`, `policy` is the run folder of a training. The viewer takes each new policy of
-        this training.
+        this training. `terrain` is uneven ground of one kind and size.
         """
+        self._terrain = terrain
         self._fidelity: Fidelity = fidelity
         self._seed = seed
         self._follower = Follower(policy) if follow else None
@@ -211,16 +258,18 @@ class Viewer:
         self._given = self._name = next(iter(self._policies))
         loaded = load_policy(folder)
         self.server = serve(host, port)
-        self.figure = Figure(self.server, render.shown_robot(loaded))
+        self.figure = Figure(self.server, render.shown_robot(loaded, terrain))
         self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
         self._rng = np.random.default_rng(seed)
         self._play(loaded)
 
     def _play(self, policy: Policy) -> None:
         """Starts a new session with the policy, and draws its robot."""
-        if self.figure.robot is not render.shown_robot(policy):
-            self.figure.draw(render.shown_robot(policy))
-        self.session = Session(policy, trials.engine(policy, self._fidelity), self._seed)
+        robot = render.shown_robot(policy, self._terrain)
+        if self.figure.robot is not robot:
+            self.figure.draw(robot)
+        engine = trials.engine(policy, self._fidelity, self._terrain)
+        self.session = Session(policy, engine, self._seed)
         self.session.advance(np.zeros(3))  # compiles
         self.panel.allow(float(policy.curriculum.v_max))
         self._pacer = Pacer(self.session.dt)

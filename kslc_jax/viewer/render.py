@@ -4,15 +4,20 @@ Call `runtime.prepare()` before you import anything that imports mujoco: it choo
 """
 
 import contextlib
+import copy
 import os
 from collections.abc import Generator, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import jax
 import mujoco
 import numpy as np
 
+from kslc_jax import ground as ground_lib
 from kslc_jax import robot as robot_lib
+from kslc_jax.config import TerrainConfig
 from kslc_jax.errors import MissingPackage
+from kslc_jax.ground import Ground
 from kslc_jax.robot import Robot
 from kslc_jax.runtime import first_line
 
@@ -50,9 +55,23 @@ def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mu
         ) from error
 
 
-def shown_robot(policy: "Policy") -> Robot:
-    """The policy's robot at high fidelity; the training model has shapes that should be hidden."""
-    return robot_lib.load("high", name=policy.config.physics.robot)
+def shown_robot(policy: "Policy", terrain: TerrainConfig | None = None) -> Robot:
+    """The policy's robot at high fidelity; the training model has shapes that should be hidden.
+
+    `terrain`: uneven ground of one kind and size.
+    """
+    return robot_lib.load("high", name=policy.config.physics.robot, terrain=terrain)
+
+
+def put_ground(robot: Robot, model: mujoco.MjModel, ground: Ground, x: float, y: float) -> float:
+    """Moves the height field of `model`, a copy of the robot's, to where a robot is.
+
+    Returns the height of the ground there [m].
+    """
+    (floor,) = robot.ground_geom_ids
+    pos, quat, far = ground_lib.place(ground, x, y, np)
+    model.geom_pos[floor], model.geom_quat[floor], model.geom_dataid[floor] = pos, quat, int(far)
+    return float(ground_lib.height(ground, x, y, np))
 
 
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
@@ -63,7 +82,12 @@ def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> m
 
 
 def frames(
-    robot: Robot, qpos: np.ndarray, width: int = 640, height: int = 480, distance: float = 3.0
+    robot: Robot,
+    qpos: np.ndarray,
+    width: int = 640,
+    height: int = 480,
+    distance: float = 3.0,
+    ground: Ground | None = None,
 ) -> Iterator[np.ndarray]:
     """Yields one picture [height, width, 3] per row of a trajectory.
 
@@ -74,16 +98,23 @@ def frames(
       qpos: [T, 7 + n] trajectory.
       width, height: size of a picture [pixels].
       distance: distance of the camera [m] for XBot-L; it scales with the robot's size.
+      ground: [T] uneven ground, if the robot has it.
     """
-    model, size = robot.mj_model, robot.length_ratio
+    model, size, floor = copy.copy(robot.mj_model), robot.length_ratio, 0.0
     data, cam = mujoco.MjData(model), camera(distance * size)
     with _renderer(model, height, width) as renderer:
-        for q in qpos:
+        for i, q in enumerate(qpos):
             data.qpos[:] = q
+            if ground is not None:
+                floor = put_ground(robot, model, _row(ground, i), q[0], q[1])
             mujoco.mj_forward(model, data)
-            cam.lookat[:] = [q[0], q[1], EYE_LEVEL * size]
+            cam.lookat[:] = [q[0], q[1], EYE_LEVEL * size + floor]
             renderer.update_scene(data, cam)
             yield renderer.render()
+
+
+def _row(ground: Ground, i: int) -> Ground:
+    return jax.tree.map(lambda x: x[i], ground)
 
 
 def gait_strip(
@@ -93,6 +124,7 @@ def gait_strip(
     interval: float = 0.25,
     width: int = 1800,
     height: int = 420,
+    ground: Ground | None = None,
 ) -> np.ndarray:
     """One picture [height, width, 3] with the robot every `interval` seconds, as in the paper.
 
@@ -104,15 +136,21 @@ def gait_strip(
       dt: time between two rows of `qpos` [s].
       interval: time between two images of the robot [s].
       width, height: size of the picture [pixels].
+      ground: [T] uneven ground, if the robot has it.
     """
-    model, size = robot.mj_model, robot.length_ratio
+    model, size = copy.copy(robot.mj_model), robot.length_ratio
     shown = qpos[:: round(interval / dt)]
     middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
     cam = camera(0.0, elevation=-6.0)
+    across, floors = shown[:, 1].mean(), np.zeros(1)
+    if ground is not None:
+        put_ground(robot, model, _row(ground, 0), middle, across)
+        floors = ground_lib.height(_row(ground, 0), shown[:, 0], shown[:, 1], np)
     # A long lens far away shows all images from the same angle. The distance makes all of them fit.
     half_height = np.tan(np.radians(LONG_LENS / 2))
-    cam.distance = 0.5 * max(length * height / width, TALL * size) / half_height
-    cam.lookat[:] = [middle, shown[:, 1].mean(), EYE_LEVEL * size]
+    tall = TALL * size + np.ptp(floors)
+    cam.distance = 0.5 * max(length * height / width, tall) / half_height
+    cam.lookat[:] = [middle, across, EYE_LEVEL * size + floors.mean()]
     data = mujoco.MjData(model)
     lens = _field_of_view(model, LONG_LENS)
     with lens, _renderer(model, height, width, max_geom=20_000) as renderer:

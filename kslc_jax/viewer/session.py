@@ -15,6 +15,7 @@ from kslc_jax import env, maths, physics, signals
 from kslc_jax.config import Config, PhysicsConfig
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.evaluation import trials
+from kslc_jax.ground import Ground
 from kslc_jax.networks import Params
 from kslc_jax.policy import Policy
 
@@ -60,6 +61,7 @@ class View:
     phase: jax.Array  # [] share of the gait cycle
     contact: jax.Array  # [2] bool, left and right foot
     fallen: jax.Array  # [] bool
+    ground: Ground | None  # uneven ground; None: the flat floor
 
 
 @flax.struct.dataclass
@@ -101,7 +103,7 @@ def _advance(
 
 
 def _view(config: Config, state: env.EnvState, command: jax.Array, fallen: jax.Array) -> View:
-    now = signals.read(physics.robot_for(config.physics), state.physics)
+    now = signals.read(physics.robot_for(config.physics), state.physics, state.dynamics.ground)
     return View(
         qpos=state.physics.qpos,
         command=command,
@@ -109,6 +111,7 @@ def _view(config: Config, state: env.EnvState, command: jax.Array, fallen: jax.A
         phase=state.gait.phase,
         contact=now.foot_contact,
         fallen=fallen,
+        ground=state.dynamics.ground,
     )
 
 
