@@ -133,8 +133,8 @@ class TestHeightField:
         down = np.broadcast_to([0.0, 0.0, -1.0], start.shape)
         dist, _, normal = batch.ray(start, down, normal=True)
         error = 100.0 - dist[0] - ground_lib.height(ground, *xy.T, np)
-        # The points of the field are 5 cm apart. Far from the start a stair's riser lies between two
-        # rows of them; near it the stairs bend round the flat place and cross the rows.
+        # The points of the field are 5 cm apart. Far from the start a stair's riser lies between
+        # two rows of them; near it the stairs bend round the flat place and cross the rows.
         most = {"rough": 2e-3, "slope": 5e-4, "stairs": 6e-3 if near == FAR else 25e-3}[kind]
         assert np.quantile(np.abs(error), 0.99) < most
         assert np.median(np.abs(error)) < 1e-3
@@ -328,3 +328,25 @@ class TestJudging:
         climbed = trace.qpos[-1, :, 2] - trace.qpos[100, :, 2]
         standing = trace.alive[-1]
         assert np.corrcoef(up[standing], climbed[standing])[0, 1] > 0.8
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("place", [(3.0, 1.0), FAR])
+def test_the_drawn_ground_is_the_ground(kind, place):
+    """The browser's mesh, at its place, has the function's heights at its points."""
+    shapes = pytest.importorskip(
+        "kslc_jax.viewer.shapes", reason="the extra 'viewer' is not installed"
+    )
+    bot, ground = robot.load("high", terrain=only(kind)), ground_of(kind)
+    pos, quat, far = ground_lib.place(ground, *place, np)
+    vertices, faces = shapes.ground(bot.mj_model, int(far))
+    turned = np.zeros(9)
+    mujoco.mju_quat2Mat(turned, np.asarray(quat, np.float64))
+    world = pos + vertices @ turned.reshape(3, 3).T
+    near = world[np.hypot(*(world[:, :2] - place).T) < 4.0]
+    heights = ground_lib.height(ground, near[:, 0], near[:, 1], np)
+    assert np.quantile(np.abs(near[:, 2] - heights), 0.99) < 1e-3
+    assert faces.max() == len(vertices) - 1
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (normal[:, 2] > 0).all()
