@@ -118,11 +118,11 @@ class Figure:
         ]
 
     def _put_ground(self, ground: Ground, x: float, y: float) -> float:
-        """Shows the ground around x and y [m]; returns its height there [m]."""
+        """Shows the ground around x and y [m]; returns its mean height there [m]."""
         pos, quat, far = ground_lib.place(ground, x, y, np)
         for i, window in enumerate(self._windows):
             window.visible, window.position, window.wxyz = i == int(far), pos, quat
-        return float(ground_lib.height(ground, x, y, np))
+        return ground_lib.level(ground, x, y)
 
     def show(self, view: View) -> None:
         """Moves every body to its pose in the view."""
