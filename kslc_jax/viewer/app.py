@@ -42,6 +42,7 @@ SHOWN_GROUP = 2
 """Highest geom group that is drawn, as in MuJoCo's own viewer."""
 
 GROUND_COLOR = (214, 218, 224)
+"""Colour of uneven ground: red, green, blue."""
 
 SLOW = 0.95
 """Share of the chosen playback speed. At a lower speed the page says "too slow"."""
