@@ -19,6 +19,7 @@ from kslc_jax import (
     randomize,
     robot,
     signals,
+    sim2sim,
     similar,
 )
 from kslc_jax import ground as ground_lib
@@ -310,6 +311,14 @@ class TestJudging:
     def test_bad_ground(self, text):
         with pytest.raises(ConfigError, match="ground: "):
             perturbations.terrain(text)
+
+    def test_it_is_a_condition_of_sim2sim(self):
+        args = sim2sim.Args("x", ground=("rough:0.05", "slope:10"), perturb=("payload=5",))
+        assert args.conditions == ("nominal", "rough:0.05", "slope:10", "payload=5")
+        terrains = [sim2sim.setting(args, HighFidelity(), c).physics for c in args.conditions]
+        assert [t.uneven for t in terrains] == [None, only("rough"), only("slope"), None]
+        with pytest.raises(ConfigError, match="need --engine mujoco"):
+            sim2sim.Args("x", engine="drake", ground=("slope:10",))
 
     def test_ground_beyond_the_training_is_marked(self):
         policy = load_policy("xbot_l_run")
