@@ -149,7 +149,8 @@ class TestHeightField:
         up = np.c_[-gradient, np.ones(len(xy))]
         up /= np.linalg.norm(up, axis=1, keepdims=True)
         angle = np.degrees(np.arccos(np.clip(np.sum(up * normal[0], 1), -1, 1)))
-        assert np.quantile(angle, 0.7) < {"rough": 4.0, "slope": 0.5, "stairs": 1.0}[kind]
+        # A stair's round edge reaches 1 cm into the next facet, which then leans by 5.7 degrees.
+        assert np.quantile(angle, 0.7) < {"rough": 4.0, "slope": 0.5, "stairs": 3.0}[kind]
 
 
 def standing(config: PhysicsConfig, kind: str | None, place, steps: int, yaw: float = 0.6):
