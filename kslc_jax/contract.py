@@ -117,7 +117,7 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     from kslc_jax import env, physics
     from kslc_jax.evaluation import trials
 
-    setting = trials.Setting(policy.config.physics)
+    setting = trials.Setting(trials.engine(policy, "train"))  # on the flat floor
     config = trials.trial_config(policy.config, setting, len(SHARES))
     config = trials.without_joint_noise(config)
     robot = physics.robot_for(config.physics)

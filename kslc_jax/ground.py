@@ -185,3 +185,9 @@ def place(ground: Ground, x, y, xp: Any = jnp):
     zero, half = xp.zeros_like(along), 0.5 * ground.yaw
     quat = xp.stack([xp.cos(half), zero, zero, xp.sin(half)])
     return xp.append(middle, rise - reach(ground)), quat, (along != 0) | (across != 0)
+
+
+def level(ground: Ground, x: float, y: float) -> float:
+    """Mean height [m] of a square of one tread around x and y: a camera follows it. Numpy."""
+    around = TREAD * np.linspace(-0.5, 0.5, 21)
+    return float(height(ground, *np.meshgrid(x + around, y + around), np).mean())

@@ -30,6 +30,7 @@ SLOW = {
     "Train a variant of the robot": "a training",
     "Use the environment with another learner": "compiles an environment step",
     "Change the speed range": "two trainings",
+    "Train on uneven ground": "a training, and trials in C MuJoCo",
     "Use more environments on a GPU": "a training",
     "Stop and resume": "two trainings go on",
     "Start from a trained policy": "a training",

@@ -27,7 +27,7 @@ COMMANDS = tuple(f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "play", 
 NO_TRAINING = [n for n in MODULES if n.startswith(WINGS) or n in ("kslc_jax.policy", *COMMANDS)]
 
 OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "viser"}
-OPTIONAL |= {"kslc_jax.viewer.panel": "viser"}
+OPTIONAL |= {"kslc_jax.viewer.panel": "viser", "kslc_jax.viewer.shapes": "trimesh"}
 """Modules that need an optional package, with its name."""
 
 LIGHT = (

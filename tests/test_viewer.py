@@ -156,14 +156,14 @@ def volume(model, geom) -> float:
 
 
 def test_meshes_have_the_geoms_size_and_place():
-    viewer = pytest.importorskip(
-        "kslc_jax.viewer.app", reason="the extra 'viewer' is not installed"
+    shapes = pytest.importorskip(
+        "kslc_jax.viewer.shapes", reason="the extra 'viewer' is not installed"
     )
     model = robot.load("high").mj_model
     drawn = np.flatnonzero(model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)
     assert len(drawn) > 40
     for geom in drawn:
-        mesh = viewer.mesh(model, geom)
+        mesh = shapes.mesh(model, geom)
         assert mesh.volume == pytest.approx(volume(model, geom), rel=0.03), model.geom(geom).name
         np.testing.assert_allclose(mesh.bounds.mean(0), model.geom_pos[geom], atol=1e-3)
 

@@ -73,6 +73,7 @@ def fill(model: mujoco.MjModel, heights: Sequence[np.ndarray]) -> None:
         share = (field + reach) / (2 * reach)  # MuJoCo stores shares of the size
         first = model.hfield_adr[i]
         model.hfield_data[first : first + field.size] = share.ravel()
+    model.geom(FLOOR).castshadow = 0  # the field is coarser than the map of its shadow
 
 
 def _let_the_ground_move(spec: mujoco.MjSpec) -> None:

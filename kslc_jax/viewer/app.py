@@ -13,11 +13,8 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import trimesh
 import viser
 from trimesh.exchange.gltf import export_glb
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
 
 from kslc_jax import ground as ground_lib
 from kslc_jax import policy as policy_lib
@@ -27,16 +24,13 @@ from kslc_jax.evaluation import trials
 from kslc_jax.ground import Ground
 from kslc_jax.policy import Policy, load_policy
 from kslc_jax.robot import Robot
-from kslc_jax.viewer import panel, render
+from kslc_jax.viewer import panel, render, shapes
 from kslc_jax.viewer.following import Follower
 from kslc_jax.viewer.session import Pacer, Session, View
 
 FPS = 30
 PANEL_HZ = 10
 """Redraws of plots and status text per second."""
-
-GAMMA = 2.2
-"""Exponent that turns MuJoCo's colours into the linear colours of glTF."""
 
 CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
 """Start position and target of the camera, relative to the robot [m]; field of view [degrees]."""
@@ -48,66 +42,13 @@ SHOWN_GROUP = 2
 """Highest geom group that is drawn, as in MuJoCo's own viewer."""
 
 GROUND_COLOR = (214, 218, 224)
-
-COARSER = 2
-"""Distance of the points of the drawn ground by that of the height field."""
+"""Colour of uneven ground: red, green, blue."""
 
 SLOW = 0.95
 """Share of the chosen playback speed. At a lower speed the page says "too slow"."""
 
 
 # -------------------------------------------------------------------------------------------- robot
-
-
-def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
-    """The mesh of a geom, in the frame of its body and the colour of its material."""
-    kinds, create = mujoco.mjtGeom, trimesh.creation
-    size = model.geom_size[geom]
-    kind = model.geom_type[geom]
-    if kind == kinds.mjGEOM_BOX:
-        shape = create.box(extents=2.0 * size)
-    elif kind == kinds.mjGEOM_CAPSULE:
-        shape = create.capsule(radius=size[0], height=2.0 * size[1])
-    elif kind == kinds.mjGEOM_CYLINDER:
-        shape = create.cylinder(radius=size[0], height=2.0 * size[1])
-    elif kind == kinds.mjGEOM_ELLIPSOID:
-        shape = create.icosphere(subdivisions=3).apply_scale(size)
-    elif kind == kinds.mjGEOM_SPHERE:
-        shape = create.icosphere(subdivisions=3, radius=size[0])
-    elif kind == kinds.mjGEOM_MESH:
-        shape = trimesh.Trimesh(*mesh_data(model, int(model.geom_dataid[geom])), process=False)
-    else:
-        raise ValueError(f"geom {model.geom(geom).name}: no picture of a {kinds(kind).name}")
-    placed = trimesh.transformations.quaternion_matrix(model.geom_quat[geom])
-    placed[:3, 3] = model.geom_pos[geom]
-    shape = trimesh.graph.smooth_shade(shape.apply_transform(placed))
-    material = model.geom_matid[geom]
-    rgba = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material]).copy()
-    rgba[:3] **= GAMMA
-    paint = PBRMaterial(baseColorFactor=rgba, metallicFactor=0.0, roughnessFactor=0.7)
-    shape.visual = TextureVisuals(material=paint)
-    return shape
-
-
-def mesh_data(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3, m] and faces [F, 3] of a mesh of the model."""
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
-
-
-def ground_mesh(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3, m] and faces [F, 3] of a height field, with every `COARSER`th point."""
-    rows, columns = model.hfield_nrow[field], model.hfield_ncol[field]
-    first, (along, across, top, _) = model.hfield_adr[field], model.hfield_size[field]
-    data = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
-    heights = top * data[::COARSER, ::COARSER]
-    y, x = (np.linspace(-h, h, n) for h, n in zip((across, along), heights.shape, strict=True))
-    vertices = np.stack([*np.meshgrid(x, y), heights], -1).reshape(-1, 3)
-    index = np.arange(heights.size).reshape(heights.shape)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
-    faces = np.stack([a, b, d, a, d, c], -1).reshape(-1, 3)
-    return vertices.astype(np.float32), faces.astype(np.uint32)
 
 
 class Figure:
@@ -147,7 +88,7 @@ class Figure:
             name = f"/world/{model.body(body).name}"
             if body not in self._bodies:
                 self._bodies[body] = scene.add_frame(name, show_axes=False)
-            glb = export_glb(mesh(model, geom), include_normals=True)
+            glb = export_glb(shapes.mesh(model, geom), include_normals=True)
             scene.add_glb(f"{name}/{geom}", glb)
 
     @staticmethod
@@ -170,7 +111,7 @@ class Figure:
         self._windows = [
             scene.add_mesh_simple(
                 f"/world/ground_{i}",
-                *ground_mesh(self._model, i),
+                *shapes.ground(self._model, i),
                 color=GROUND_COLOR,
                 visible=False,
             )
@@ -178,11 +119,11 @@ class Figure:
         ]
 
     def _put_ground(self, ground: Ground, x: float, y: float) -> float:
-        """Shows the ground around x and y [m]; returns its height there [m]."""
+        """Shows the ground around x and y [m]; returns its mean height there [m]."""
         pos, quat, far = ground_lib.place(ground, x, y, np)
         for i, window in enumerate(self._windows):
             window.visible, window.position, window.wxyz = i == int(far), pos, quat
-        return float(ground_lib.height(ground, x, y, np))
+        return ground_lib.level(ground, x, y)
 
     def show(self, view: View) -> None:
         """Moves every body to its pose in the view."""

@@ -66,12 +66,12 @@ def shown_robot(policy: "Policy", terrain: TerrainConfig | None = None) -> Robot
 def put_ground(robot: Robot, model: mujoco.MjModel, ground: Ground, x: float, y: float) -> float:
     """Moves the height field of `model`, a copy of the robot's, to where a robot is.
 
-    Returns the height of the ground there [m].
+    Returns the mean height of the ground around it [m].
     """
     (floor,) = robot.ground_geom_ids
     pos, quat, far = ground_lib.place(ground, x, y, np)
     model.geom_pos[floor], model.geom_quat[floor], model.geom_dataid[floor] = pos, quat, int(far)
-    return float(ground_lib.height(ground, x, y, np))
+    return ground_lib.level(ground, x, y)
 
 
 def camera(distance: float, azimuth: float = 90.0, elevation: float = -8.0) -> mujoco.MjvCamera:
