@@ -65,10 +65,10 @@ class Args:
     checkpoint folder, or the name of a shipped policy. With a lower --ppo.learning-rate the policy
     keeps more of its skill."""
     seeds: int = 1
-    """Number of trainings in one program. They have the seeds --seed, --seed + 1, ... and ordinary
-    run folders, RUN_DIR/seed-0 and so on. --resume --run-dir RUN_DIR goes on with all of them,
-    --resume --run-dir RUN_DIR/seed-0 with one. On an accelerator they train faster than one after
-    the other, on a CPU they do not. A seed whose numbers go bad stops; the others go on."""
+    """Number of trainings in one program, side by side on one device: of the seeds --seed,
+    --seed + 1, ... Each has an ordinary run folder, RUN_DIR/seed-0 and so on. --resume --run-dir
+    RUN_DIR goes on with all of them, --resume --run-dir RUN_DIR/seed-0 with one. A seed whose
+    numbers go bad stops and is named; the others go on."""
     profile: int = 0
     """Trace this many train steps with the profiler, after the first one, into the run folder."""
     wandb: bool = False

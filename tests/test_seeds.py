@@ -16,7 +16,7 @@ from rich.console import Console
 from kslc_jax import checkpoint_format, files, train, train_step
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import preset
-from kslc_jax.training import checkpoint, run_folder, seeds
+from kslc_jax.training import checkpoint, recorder, run_folder, seeds
 from kslc_jax.training.logs import SeedsProgress
 
 DEBUG = preset("debug")
@@ -124,6 +124,10 @@ def test_a_stopped_training_goes_on_as_a_whole(training, capsys):
     assert [steps_of(f) for f in training.folders] == [list(range(1, STEPS + 1))] * COUNT
     assert training(lambda state: state, "--resume") == 0
     assert "nothing to do" in capsys.readouterr().out
+    assert train.main(["--resume", "--run-dir", str(training.folders[2])]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("resuming with seeds 1 instead of 3 (bits may differ from here): ")
+    assert "nothing to do" in out
 
 
 def test_a_kill_between_two_saves_leaves_seeds_at_different_steps(training, capsys):
@@ -150,8 +154,39 @@ def test_a_bad_seed_stops_alone_and_is_named(training, capsys):
     for folder in (training.folders[0], training.folders[2]):
         assert steps_of(folder) == list(range(1, STEPS + 1))
         assert checkpoint.Store(folder).steps()[-1] == STEPS
+    assert training(bad_from(3, 1), "--resume") == 1  # the others have nothing to do
+    assert capsys.readouterr().err == err
     assert training(lambda state: state, "--resume") == 0  # now it is good: it catches up
     assert steps_of(training.folders[1]) == list(range(1, STEPS + 1))
+
+
+def test_a_bad_seed_far_behind_does_not_keep_the_others(training, capsys):
+    """They end at their last train step, and then nobody waits for the bad one."""
+    assert training(stop_at(3), "--seeds", COUNT) == 0
+    for step in "34":
+        shutil.rmtree(training.folders[0] / files.CHECKPOINTS / step)
+    assert training(bad_from(2, 0), "--resume") == 1
+    assert "2 of 3 seeds are done; stopped: seed-0 (train step 3: " in capsys.readouterr().err
+    assert steps_of(training.folders[0]) == [1, 2, 3]
+    for folder in training.folders[1:]:
+        assert steps_of(folder) == list(range(1, STEPS + 1))
+        assert checkpoint.Store(folder).steps()[-1] == STEPS
+
+
+def test_a_seed_that_cannot_be_saved_does_not_end_the_others(training, monkeypatch, capsys):
+    finish = recorder.Recorder.finish
+
+    def fails(self, state, record):
+        if self._run_dir.name == "seed-0":
+            raise checkpoint_format.CheckpointError("no space")
+        finish(self, state, record)
+
+    monkeypatch.setattr(recorder.Recorder, "finish", fails)
+    assert training(lambda state: state, "--seeds", COUNT) == 2
+    out, err = capsys.readouterr()
+    assert err == "error: no space\n" and "seed-0: warning: no space" in out
+    saved = [checkpoint.Store(folder).steps()[-1] for folder in training.folders]
+    assert saved == [STEPS - 1, STEPS, STEPS]
 
 
 def test_no_good_seed_ends_it(training, capsys):
@@ -214,28 +249,50 @@ def test_table_has_median_lowest_and_highest():
     assert "v_max 1.0 m/s (0.5 m/s to 3.5 m/s)" in progress._line(rows[0])
 
 
-@pytest.mark.slow(reason="compiles a second train step")
-def test_a_seed_computes_what_it_computes_alone(tmp_path):
-    """The first state is equal to the bit. XLA multiplies the matrices of all seeds in one batched
-    product, which sums in another order; so numbers agree to float32 rounding after a few steps."""
-    init, step = seeds.make(DEBUG, 2)
-    together, told = init(), []
-    for seed in range(2):
-        first = train_step.make(dataclasses.replace(DEBUG, seed=seed))[0]()
-        for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(together), strict=True):
-            np.testing.assert_array_equal(
-                checkpoint_format.host_array(a), checkpoint_format.host_array(b)[seed]
-            )
-    for _ in range(2):
-        together, metrics = step(together)
-        told.append(metrics)
-    for seed in range(2):
-        single, step_one = train_step.make(dataclasses.replace(DEBUG, seed=seed))
-        state = single()
-        for together_metrics in told:
-            state, metrics = step_one(state)
+ALONE = {"rtol": 1e-3, "atol": 1e-4}
+"""XLA multiplies the matrices of all seeds in one batched product, which sums in another order. So
+a seed agrees with its own single run to float32 rounding, for a few steps."""
+
+
+@pytest.mark.slow(reason="compiles two programs of the train step")
+def test_a_seed_computes_what_it_computes_alone():
+    """The first states are equal to the bit."""
+    together, step = seeds.make(DEBUG, 2)[0](), seeds.make(DEBUG, 2)[1]
+    singles = [train_step.make(dataclasses.replace(DEBUG, seed=seed)) for seed in range(2)]
+    states = [init() for init, _ in singles]
+    for seed, state in enumerate(states):
+        for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(together), strict=True):
+            a, b = checkpoint_format.host_array(a), checkpoint_format.host_array(b)[seed]
+            np.testing.assert_array_equal(a, b)
+    for _ in range(3):
+        together, told = step(together)
+        for seed, (_, single) in enumerate(singles):
+            states[seed], metrics = single(states[seed])
             for name, value in metrics.items():
-                np.testing.assert_allclose(
-                    together_metrics[name][seed], value, rtol=1e-3, atol=1e-4, err_msg=name
-                )
-        assert int(seeds.one_of(together, seed).step) == 2
+                np.testing.assert_allclose(told[name][seed], value, **ALONE, err_msg=name)
+    for seed, state in enumerate(states):
+        its = seeds.one_of(together, seed)
+        for a, b in zip(jax.tree.leaves(its.learner), jax.tree.leaves(state.learner), strict=True):
+            np.testing.assert_allclose(a, b, **ALONE)
+
+
+@pytest.mark.slow(reason="compiles two programs of the train step")
+def test_resumes_as_a_whole_bit_for_bit_and_alone(tmp_path):
+    """Through the command line, in C MuJoCo."""
+
+    def run(name, *args):
+        where = ["--run-dir", str(tmp_path / name), "--run.snapshots", "0"]
+        assert train.main([*where, *map(str, args)]) == 0
+
+    def seed(name, number):
+        return records(tmp_path / name / f"seed-{number}")
+
+    run("whole", "--preset", "debug", "--seeds", 2, "--steps", 4 * DEBUG.batch_size)
+    run("parts", "--preset", "debug", "--seeds", 2, "--steps", 2 * DEBUG.batch_size)
+    run("parts", "--resume", "--steps", 3 * DEBUG.batch_size)
+    assert [seed("parts", i) for i in range(2)] == [seed("whole", i)[:3] for i in range(2)]
+    run("parts/seed-1", "--resume", "--steps", 4 * DEBUG.batch_size)
+    alone, whole = seed("parts", 1)[3], seed("whole", 1)[3]
+    assert alone["step"] == 4
+    for name, value in whole.items():
+        np.testing.assert_allclose(alone[name], value, **ALONE, err_msg=name)

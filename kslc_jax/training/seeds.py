@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from kslc_jax import files, train_step
-from kslc_jax.checkpoint_format import has_checkpoints
+from kslc_jax.checkpoint_format import CheckpointError, has_checkpoints
 from kslc_jax.config import Config, RunConfig
 from kslc_jax.train_step import Metrics, TrainState
 from kslc_jax.training import recorder as recorder_lib
@@ -91,7 +91,7 @@ class _Seed:
     record: Record = dataclasses.field(default_factory=dict)
     step: int = 0  # train steps done
     over: bool = False  # True: all its train steps are done and saved, or its numbers went bad
-    bad: str = ""  # why it stopped
+    bad: str = ""  # why it stopped early
 
     @property
     def last(self) -> bool:
@@ -195,13 +195,22 @@ class SeedsRecorder(NullRecorder):
                 seed.recorder.keep_snapshot(one_of(state, i), seed.step)
 
     def finish(self, state: TrainState, record: Record) -> None:
-        for i, seed in self._going():
-            self._finish(i, seed, state)
+        """Saves all seeds that train. CheckpointError if one of them cannot be saved."""
+        failed = [self._finish(i, seed, state) for i, seed in self._going()]
+        for error in filter(None, failed):
+            raise error
 
-    def _finish(self, index: int, seed: _Seed, state: TrainState) -> None:
-        if seed.check.finite:
-            seed.recorder.finish(one_of(state, index), seed.record)
+    def _finish(self, index: int, seed: _Seed, state: TrainState) -> CheckpointError | None:
+        """Writes the last checkpoint of a seed; a failure must not end the others."""
         seed.over = True
+        try:
+            if seed.check.finite:
+                seed.recorder.finish(one_of(state, index), seed.record)
+        except CheckpointError as error:
+            seed.bad = str(error)
+            seed.progress.warn(seed.bad)
+            return error
+        return None
 
 
 class SeedsCheck(NumericsCheck):
@@ -218,7 +227,12 @@ class SeedsCheck(NumericsCheck):
     finite = good
 
     def before(self, state: TrainState) -> None:
-        """Keeps no copy: a seed that stops resumes from its checkpoint."""
+        """NumbersError if no seed trains any more: some have stopped, the others are done.
+
+        It keeps no copy of the state, because a seed that stops resumes from its checkpoint.
+        """
+        if all(seed.over for seed in self._seeds):
+            self.require_some_good()
 
     def after(self, metrics: Record) -> str:
         """Checks the latest record of each seed that trains. The seeds say their own warnings."""
@@ -235,9 +249,7 @@ class SeedsCheck(NumericsCheck):
         return ""
 
     def require_good(self) -> None:
-        """NumbersError if no seed trains any more: the others are done, or stopped, too."""
-        if all(seed.over for seed in self._seeds):
-            self.require_some_good()
+        """Does nothing: `after` has stopped the bad seeds."""
 
     def require_some_good(self) -> None:
         """NumbersError if a seed has stopped, or has learnt nothing; the others are saved."""
@@ -251,7 +263,7 @@ class SeedsCheck(NumericsCheck):
         if bad:
             names = ", ".join(f"{s.folder.name} (train step {s.step}: {s.bad})" for s in bad)
             raise NumbersError(
-                f"{len(self._seeds) - len(bad)} of {len(self._seeds)} seeds are done, but the "
-                f"numbers of others went bad: {names}; go on with one alone: python -m "
-                f"kslc_jax.train --resume --run-dir {shlex.quote(str(bad[0].folder))}"
+                f"{len(self._seeds) - len(bad)} of {len(self._seeds)} seeds are done; stopped: "
+                f"{names}; go on with one alone: python -m kslc_jax.train --resume --run-dir "
+                f"{shlex.quote(str(bad[0].folder))}"
             )
