@@ -256,14 +256,14 @@ a seed agrees with its own single run to float32 rounding, for a few steps."""
 
 @pytest.mark.slow(reason="compiles two programs of the train step")
 def test_a_seed_computes_what_it_computes_alone():
-    """The first states are equal to the bit."""
+    """The first states agree as well; without the compiler flags of these tests to the last bit."""
     together, step = seeds.make(DEBUG, 2)[0](), seeds.make(DEBUG, 2)[1]
     singles = [train_step.make(dataclasses.replace(DEBUG, seed=seed)) for seed in range(2)]
     states = [init() for init, _ in singles]
     for seed, state in enumerate(states):
         for a, b in zip(jax.tree.leaves(state), jax.tree.leaves(together), strict=True):
             a, b = checkpoint_format.host_array(a), checkpoint_format.host_array(b)[seed]
-            np.testing.assert_array_equal(a, b)
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
     for _ in range(3):
         together, told = step(together)
         for seed, (_, single) in enumerate(singles):

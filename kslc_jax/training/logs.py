@@ -205,7 +205,7 @@ class SeedsProgress(Progress):
     def __init__(self, config: Config, console: Console | None = None):
         super().__init__(config, console)
         self.records: list[dict[str, float]] = []
-        """The latest record of each seed."""
+        """The latest record of each seed that trains."""
         self.stopped: list[str] = []
         """Names of the seeds whose numbers went bad."""
 
@@ -217,7 +217,8 @@ class SeedsProgress(Progress):
     def _title(self) -> str:
         rate = sum(record["steps_per_second"] for record in self.records)
         stopped = f"; stopped: {', '.join(self.stopped)}" if self.stopped else ""
-        return f"{len(self.records)} seeds, {rate:.0f} steps/s in all{stopped}"
+        count = len(self.records)
+        return f"{count} seed{'s' * (count > 1)}, {rate:.0f} steps/s in all{stopped}"
 
     def _line(self, record: dict[str, float]) -> str:
         middle, low, high = map(self._headline, self._columns())
