@@ -7,8 +7,8 @@ printed, and written to a file of its own, as soon as it is done. The parts, in 
 - exact: is a training bit-exact over two runs and over a resume, in one process and in two, with
   and without XLA's deterministic operations? The cost of these in steps/s;
 - paper: steps/s of the `paper` preset;
-- large: steps/s with 2 and 4 times the environments, with as many minibatches as before and with 2
-  and 4 times as many; with --train also the time until commands of 3.5 m/s;
+- large: steps/s with 2 and 4 times the environments and minibatches; with --train also the time
+  until commands of 3.5 m/s;
 - brax: steps/s of Brax PPO and of ours, in turn.
 """
 

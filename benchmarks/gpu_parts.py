@@ -194,14 +194,13 @@ def large(args: Args) -> Numbers:
 
 
 def larger(base: Config) -> dict[str, Config]:
-    """2 and 4 times the environments, with as many minibatches as before and as large ones."""
+    """2 and 4 times the environments and the minibatches, so that these stay as large as before."""
     configs = {}
     for factor in (2, 4):
         config = timing.resized(base, factor * base.env.num_envs)
-        for minibatches in (base.ppo.minibatches, factor * base.ppo.minibatches):
-            ppo = dataclasses.replace(config.ppo, minibatches=minibatches)
-            shape = f"{config.env.num_envs} x {ppo.rollout_steps}, {minibatches} minibatches"
-            configs[shape] = dataclasses.replace(config, ppo=ppo)
+        ppo = dataclasses.replace(config.ppo, minibatches=factor * base.ppo.minibatches)
+        name = f"{config.env.num_envs} x {ppo.rollout_steps}, {ppo.minibatches} minibatches"
+        configs[name] = dataclasses.replace(config, ppo=ppo)
     return configs
 
 
