@@ -182,9 +182,13 @@ def test_a_seed_that_cannot_be_saved_does_not_end_the_others(training, monkeypat
         finish(self, state, record)
 
     monkeypatch.setattr(recorder.Recorder, "finish", fails)
-    assert training(lambda state: state, "--seeds", COUNT) == 2
+    assert training(stop_at(3), "--seeds", COUNT) == 2
+    assert capsys.readouterr().err == "error: no space\n"
+    assert [checkpoint.Store(folder).steps()[-1] for folder in training.folders] == [3, 4, 4]
+    assert training(lambda state: state, "--resume") == 1
     out, err = capsys.readouterr()
-    assert err == "error: no space\n" and "seed-0: warning: no space" in out
+    assert "seed-0: warning: no space" in out
+    assert err.startswith("error: 2 of 3 seeds are done; stopped: seed-0 (train step 8: no space)")
     saved = [checkpoint.Store(folder).steps()[-1] for folder in training.folders]
     assert saved == [STEPS - 1, STEPS, STEPS]
 
