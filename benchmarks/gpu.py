@@ -5,7 +5,11 @@ Then it measures whole training at other matrix-product precisions of networks a
 physics always computes in full float32. All programs compile first, at the same time, on all cores.
 If a case fails, the benchmark prints it and goes on with the others.
 
+With --all it answers five questions instead (gpu_all.py), in at most eight minutes: five seeds in
+one program, bit-exactness, the `paper` preset, larger batches, Brax.
+
   python -m benchmarks.gpu --out gpu.json
+  python -m benchmarks.gpu --all --out h100.json              # writes h100-seeds.json and so on
   python -m benchmarks.gpu --preset paper --cases mjx:4096x60 --out paper.json
   python -m benchmarks.gpu --preset debug --cases mjx:16x8 --precisions --repeats 1   # anywhere
 """
@@ -25,7 +29,7 @@ from typing import Any, Literal
 import jax
 import tyro
 
-from benchmarks import throughput, timing
+from benchmarks import gpu_all, throughput, timing
 from kslc_jax import runtime
 from kslc_jax.config import Config, ConfigError, preset
 
@@ -98,10 +102,25 @@ class Args:
     """More matrix-product precisions, measured with the whole training of the first case."""
     repeats: int = 5
     """Timed calls of each program."""
+    all: bool = False
+    """Answer the questions of `questions` instead; --cases, --parts and --precisions do not count.
+    Each answer goes to a file of its own: --out gpu.json writes gpu-seeds.json, gpu-exact.json."""
+    questions: tuple[gpu_all.Part, ...] = ("seeds", "exact", "paper", "large", "brax")
+    """With --all: the questions, in this order."""
+    budget: float = 420.0
+    """With --all: no question begins after this time [s], and each ends a minute later."""
+    train: bool = False
+    """With --all: larger batches also train until commands of 3.5 m/s, in the time that is left."""
+    paper: str = "paper"
+    """With --all: preset of the question `paper`. A test takes a small one."""
 
 
 def main(args: Args) -> None:
     """Compiles all programs, measures them in turn, and prints a line for each."""
+    if args.all:
+        how = args.preset, args.paper, args.budget, args.repeats, args.train, args.out
+        gpu_all.run(gpu_all.Plan(args.questions, *how))
+        return
     try:
         configs = {case: shaped(preset(args.preset), case) for case in args.cases}
     except ConfigError as error:

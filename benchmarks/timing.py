@@ -51,14 +51,23 @@ def resized(config: Config, num_envs: int | None = None, frames: int | None = No
     return dataclasses.replace(config, env=dataclasses.replace(config.env, **changes))
 
 
-def child(module: str, args: list[str], env: dict[str, str] | None = None) -> Any:
-    """Runs `python -m MODULE ARGS` and returns its last line, which must be JSON."""
+def child(
+    module: str,
+    args: list[str],
+    env: dict[str, str] | None = None,
+    timeout: float | None = None,
+) -> Any:
+    """Runs `python -m MODULE ARGS` and returns its last line, which must be JSON.
+
+    SubprocessError if it fails, or takes longer than `timeout` [s].
+    """
     done = subprocess.run(
         [sys.executable, "-m", module, *args],
         env={**os.environ, **(env or {})},
         stdout=subprocess.PIPE,
         text=True,
         check=True,
+        timeout=timeout,
     )
     return json.loads(done.stdout.splitlines()[-1])
 

@@ -54,6 +54,23 @@ LEARNING = "learning.json"
 MILESTONES = "milestones.json"
 """In the folder of a shipped policy: environment steps until the commands reached each speed."""
 
+SEED = "seed-"
+"""Beginning of the names of the run folders of `train --seeds`, within the folder of all."""
+
+
+def seed_folder(run_dir: Path, seed: int) -> Path:
+    """The run folder of one seed of `train --seeds`."""
+    return run_dir / f"{SEED}{seed}"
+
+
+def seeds_in(run_dir: Path) -> list[int]:
+    """The seeds that have a run folder in `run_dir`, in ascending order; none in a run folder."""
+    if (run_dir / CONFIG).exists():
+        return []
+    names = [path.parent.name.removeprefix(SEED) for path in run_dir.glob(f"{SEED}*/{CONFIG}")]
+    return sorted(int(name) for name in names if name.isdecimal())
+
+
 # ------------------------------------------------------------------------------------- writing
 
 

@@ -12,6 +12,7 @@ Examples:
   python -m kslc_jax.train --preset laptop --without arms --seed 1
   python -m kslc_jax.train --ppo.epochs 4 --env.num-envs 1024
   python -m kslc_jax.train --resume --run-dir runs/laptop-seed0
+  python -m kslc_jax.train --seeds 5                # five seeds in one program, side by side
   python -m kslc_jax.train --profile 3              # trace the time of three train steps
   srun python -m kslc_jax.train --coordinator auto  # one training of all of Slurm's tasks
 """
@@ -27,9 +28,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from kslc_jax import cli, runtime
+from kslc_jax import cli, files, runtime
 from kslc_jax import config as config_lib
-from kslc_jax.config import XBOT_L, Config, ConfigError
+from kslc_jax.config import COUNTER, XBOT_L, Config, ConfigError
 from kslc_jax.errors import UserError
 
 if TYPE_CHECKING:
@@ -53,8 +54,8 @@ class Args:
     """Parts of the method to leave out, for ablations: arms, angular-momentum, velocity-rewards,
     velocity-curriculum, cycle-curriculum."""
     run_dir: Path | None = None
-    """Run folder. The default is runs/PRESET-seedN; another robot than xbot_l puts its name in
-    front of PRESET, and each ablation adds -no-PART to it."""
+    """Run folder. The default is runs/PRESET-seedN, with --seeds runs/PRESET-seedsM-N; another
+    robot than xbot_l puts its name in front of PRESET, and each ablation adds -no-PART to it."""
     steps: int | None = None
     """Total environment steps, counted from the beginning of the run. You can write 60e6. Short for
     --run.steps."""
@@ -64,6 +65,11 @@ class Args:
     """Begin a new training with the networks and the curriculum of this policy: a run folder, a
     checkpoint folder, or the name of a shipped policy. With a lower --ppo.learning-rate the policy
     keeps more of its skill."""
+    seeds: int = 1
+    """Number of trainings in one program, side by side on one device: of the seeds --seed,
+    --seed + 1, ... Each has an ordinary run folder, RUN_DIR/seed-0 and so on. --resume --run-dir
+    RUN_DIR goes on with all of them, --resume --run-dir RUN_DIR/seed-0 with one. A seed whose
+    numbers go bad stops and is named; the others go on."""
     profile: int = 0
     """Trace this many train steps with the profiler, after the first one, into the run folder."""
     wandb: bool = False
@@ -150,7 +156,9 @@ def parse(argv: list[str]) -> Args:
     if known.resume and not helping and not fresh:
         from kslc_jax.training import run_folder
 
-        base = run_folder.read_config(known.run_dir)
+        there = files.seeds_in(known.run_dir)
+        folder = files.seed_folder(known.run_dir, there[0]) if there else known.run_dir
+        base = run_folder.read_config(folder)
     else:  # also on a resume with a preset: run_folder names the first field that differs
         name, robot = known.preset or DEFAULT, known.robot or XBOT_L
         base = preset_for(name, robot, tuple(known.without))
@@ -159,6 +167,10 @@ def parse(argv: list[str]) -> Args:
         raise ConfigError("--resume goes on with a run, --start-from begins one: take one of them")
     if args.profile < 0:
         raise ConfigError(f"--profile: {args.profile} train steps; 0 writes no trace")
+    if args.resume and args.run_dir:
+        args = dataclasses.replace(args, seeds=_seeds_there(args, args.run_dir))
+    if args.seeds != 1:
+        _require_alone(args)
     config = args.config
     if config.physics.robot != base.physics.robot:
         raise ConfigError(
@@ -170,6 +182,36 @@ def parse(argv: list[str]) -> Args:
     return dataclasses.replace(args, config=config)
 
 
+def _seeds_there(args: Args, run_dir: Path) -> int:
+    """Number of seeds in the folder of a resume; ConfigError if --seeds says another number."""
+    there, first = files.seeds_in(run_dir), args.config.seed
+    count = max(len(there), 1)
+    if args.seeds not in (1, count):
+        raise ConfigError(f"--seeds: {run_dir} holds {len(there)} seeds, not {args.seeds}")
+    if there and there != [*range(first, first + count)]:
+        raise ConfigError(
+            f"{run_dir} holds the seeds {', '.join(map(str, there))}, not {count} in a row from "
+            f"{first}: go on with each alone, --run-dir {files.seed_folder(run_dir, there[0])}"
+        )
+    return count
+
+
+def _require_alone(args: Args) -> None:
+    """ConfigError if an option cannot be combined with --seeds."""
+    if args.seeds < 1 or args.config.seed + args.seeds > COUNTER:
+        raise ConfigError(f"--seeds: {args.seeds} seeds from {args.config.seed}, 1 to 2^31 in all")
+    excluded = {
+        "--start-from": args.start_from is not None,
+        "--profile": args.profile > 0,
+        "--wandb": args.wandb,
+        "--devices": args.devices not in ("auto", 1),
+        "--coordinator": args.coordinator is not None,
+    }
+    for name, given in excluded.items():
+        if given:
+            raise ConfigError(f"--seeds trains on one device and excludes {name}: leave one out")
+
+
 def headline(args: Args) -> tuple[str, Path]:
     """(title of the training, its run folder)."""
     if args.resume and args.run_dir is not None:
@@ -177,7 +219,9 @@ def headline(args: Args) -> tuple[str, Path]:
     name = "-no-".join([args.preset, *args.without])
     if args.robot != XBOT_L:
         name = f"{Path(args.robot).stem}-{name}"
-    folder = args.run_dir or Path("runs") / f"{name}-seed{args.config.seed}"
+    first = args.config.seed
+    numbers = f"seed{first}" if args.seeds == 1 else f"seeds{first}-{first + args.seeds - 1}"
+    folder = args.run_dir or Path("runs") / f"{name}-{numbers}"
     return f"preset {name}", folder
 
 
@@ -192,8 +236,9 @@ def _main(argv: list[str]) -> int:
     runtime.require_good_jax()
     from kslc_jax.training import devices
 
+    wanted = 1 if args.seeds > 1 else None if args.devices == "auto" else args.devices
     try:
-        mesh = devices.pick(args.config, None if args.devices == "auto" else args.devices)
+        mesh = devices.pick(args.config, wanted)
     except RuntimeError as error:  # a backend that does not start
         raise UserError(str(error)) from error
     return _train(args, mesh)
@@ -206,19 +251,21 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     from kslc_jax.training import devices, loop, run_folder
     from kslc_jax.training.logs import Progress
     from kslc_jax.training.recovery import NumbersError
+    from kslc_jax.training.seeds import SeedsProgress
 
     title, run_dir = headline(args)
     if args.resume:
-        here = run_folder.circumstances(args.config, 1 if mesh is None else mesh.size)
-        title = f"{title} {run_folder.what_changed(run_dir, here)}".rstrip()
-    progress = Progress(args.config, None if devices.is_first() else Console(quiet=True))
-    progress.say(f"{title}: {loop.describe(args.config, run_dir, mesh)}")
+        here = run_folder.circumstances(args.config, 1 if mesh is None else mesh.size, args.seeds)
+        one = files.seed_folder(run_dir, args.config.seed) if args.seeds > 1 else run_dir
+        title = f"{title} {run_folder.what_changed(one, here)}".rstrip()
+    shown = SeedsProgress if args.seeds > 1 else Progress
+    progress = shown(args.config, None if devices.is_first() else Console(quiet=True))
+    progress.say(f"{title}: {loop.describe(args.config, run_dir, mesh, args.seeds)}")
     if idle := runtime.idle_gpu():
         progress.warn(idle)
-    how = {"start_from": args.start_from, "mesh": mesh, "profile": args.profile}
-    how["wandb"] = args.wandb
+    how = args.start_from, mesh, args.profile, args.wandb, args.seeds
     try:
-        loop.train(args.config, run_dir, args.resume, progress, **how)
+        loop.train(args.config, run_dir, args.resume, progress, *how)
     except NumbersError as error:  # all processes raise it
         if devices.is_first():
             raise

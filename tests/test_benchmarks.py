@@ -1,7 +1,9 @@
 """The benchmarks: the compared programs do the same work, and all benchmarks run."""
 
+import dataclasses
 import gzip
 import json
+import signal
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -12,7 +14,19 @@ import numpy as np
 import pytest
 from states import ACTOR, XBOT
 
-from benchmarks import compile_time, gpu, memory, parts, purejaxrl, throughput, timeline, timing
+from benchmarks import (
+    compile_time,
+    gpu,
+    gpu_all,
+    gpu_parts,
+    lent_gpu,
+    memory,
+    parts,
+    purejaxrl,
+    throughput,
+    timeline,
+    timing,
+)
 from kslc_jax import observations, physics, randomize, signals, train_step
 from kslc_jax.config import preset
 
@@ -215,6 +229,112 @@ def test_gpu_goes_on_without_what_fails(capsys):
     runs = gpu.first_calls({"large": fails, "small": lambda: lambda: 3})
     assert list(runs) == ["small"] and runs["small"]() == 3
     assert "large: out of memory\n" in capsys.readouterr().out
+
+
+@pytest.fixture
+def plan(tmp_path):
+    return gpu_all.Plan(("seeds", "paper"), "debug", "debug", 100.0, 1, False, tmp_path / "g.json")
+
+
+def test_gpu_questions_go_on_without_what_fails(plan, monkeypatch, capsys):
+    """A part that fails or comes too late is told; the others are printed and written."""
+
+    def child(module, argv, env, timeout):
+        part = argv[argv.index("--part") + 1]
+        assert module == "benchmarks.gpu_parts" and timeout <= 160.0
+        if part == "seeds":
+            raise subprocess.CalledProcessError(1, "seeds")
+        return {"machine": {}, "steps/s": 1234.0}
+
+    monkeypatch.setattr(timing, "child", child)
+    monkeypatch.setattr(gpu_all.importlib.util, "find_spec", lambda name: None)
+    gpu_all.run(dataclasses.replace(plan, parts=(*plan.parts, "brax")))
+    out = capsys.readouterr().out
+    assert "seeds:\n  failed: Command 'seeds' returned" in out
+    assert "paper:\n  steps/s: 1234\n" in out and "brax: left out, brax is not installed" in out
+    assert [path.name for path in plan.out.parent.iterdir()] == ["g-paper.json"]
+    gpu_all.run(dataclasses.replace(plan, budget=0.0))
+    assert "paper: left out, 0 s are over" in capsys.readouterr().out
+
+
+def test_gpu_question_of_exactness(plan, monkeypatch):
+    """It compares the second half of the resumed run, for each setting of the flag."""
+
+    def child(module, argv, env, timeout):
+        flagged = gpu_all.DETERMINISTIC in env["XLA_FLAGS"]
+        sums = [*range(gpu_parts.STEPS)]
+        if "resumed" in argv:
+            half = sums[gpu_parts.STEPS // 2 :]
+            return {"machine": {}, "sums": sums, "resumed": half if flagged else half[::-1]}
+        rate = 80.0 if flagged else 100.0
+        return {"machine": {"device": "x"}, "sums": sums, "two runs": True, "steps/s": rate}
+
+    monkeypatch.setattr(timing, "child", child)
+    gpu_all.run(dataclasses.replace(plan, parts=("exact",)))
+    found = json.loads(plan.out.with_name("g-exact.json").read_text())
+    assert found["deterministic operations, times the steps/s"] == 0.8
+    assert found["machine"] == {"device": "x"}
+    for title, exact in ((gpu_all.AS_IT_IS, False), (gpu_all.DETERMINISTIC, True)):
+        assert found[title]["two processes"] and found[title]["resume in two processes"] == exact
+
+
+def test_larger_batches():
+    sizes = {
+        name: (config.env.num_envs, config.ppo.minibatches)
+        for name, config in gpu_parts.larger(preset("laptop")).items()
+    }
+    assert sizes == {
+        "4096 x 24, 8 minibatches": (4096, 8),
+        "8192 x 24, 16 minibatches": (8192, 16),
+    }
+
+
+@pytest.mark.slow(reason="compiles nine programs in seven processes")
+@pytest.mark.parametrize("question", ["seeds", "exact", "paper", "large"])
+def test_gpu_questions_in_small(question, plan):
+    """On the CPU a training is bit-exact, with the flag, too."""
+    gpu_all.run(dataclasses.replace(plan, parts=(question,), budget=3600.0))
+    found = json.loads(plan.out.with_name(f"g-{question}.json").read_text())
+    assert found["machine"]["jax"] == jax.__version__
+    if question == "exact":
+        for title in (gpu_all.AS_IT_IS, gpu_all.DETERMINISTIC):
+            rows = found[title]
+            assert rows["two runs"] and rows["two processes"]
+            assert rows["resume in one process"] and rows["resume in two processes"]
+    elif question == "large":
+        assert len(found) == 3
+    else:
+        assert min(v for name, v in found.items() if name.endswith("steps/s")) > 0
+
+
+def test_lent_gpu_stops_and_carries_without_environments(tmp_path, monkeypatch, capsys):
+    """The time ends by SIGTERM. The copy has one checkpoint without environments, and snapshots."""
+    sleeper = tmp_path / "kslc_jax" / "train.py"
+    sleeper.parent.mkdir()
+    sleeper.write_text("import time\ntime.sleep(1000)\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "runs" / "seed-3"
+    for name in ("checkpoints/8/env", "checkpoints/8/params", "checkpoints/9/params"):
+        (run / name).mkdir(parents=True)
+    for name in ("checkpoints/9/env", "snapshots/4/params", "tensorboard"):
+        (run / name).mkdir(parents=True)
+    for name in ("config.json", "metrics.jsonl", ".lock"):
+        (run / name).write_text("0123456789")
+    for folder in ("checkpoints/9/env", "checkpoints/9/params", "snapshots/4/params"):
+        (run / folder / "d").write_bytes(bytes(2000))
+    args = lent_gpu.Args(tmp_path / "out", seconds=0.1, run_dir=tmp_path / "runs")
+    assert lent_gpu.main(args) == -signal.SIGTERM
+    copied = sorted(str(p.relative_to(args.out)) for p in args.out.rglob("*") if p.is_file())
+    kept = ("checkpoints/9/params/d", "config.json", "metrics.jsonl", "snapshots/4/params/d")
+    assert copied == [f"seed-3/{name}" for name in kept]
+    assert "seed-3: 0.0 MB" in capsys.readouterr().out
+    assert lent_gpu.main(args) == 2 and "exists" in capsys.readouterr().err
+    sleeper.write_text("")  # a training that ends by itself
+    args = dataclasses.replace(args, out=tmp_path / "again", seconds=600.0)
+    assert lent_gpu.main(args) == 0
+    monkeypatch.setattr(lent_gpu, "LIMIT", 3000)
+    assert lent_gpu.main(dataclasses.replace(args, out=tmp_path / "large")) == 1
 
 
 @pytest.mark.slow(reason="compiles MJX three times and starts worker processes")

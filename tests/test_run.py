@@ -27,7 +27,7 @@ from kslc_jax import files, learning, ppo, runtime, train, train_step
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import ConfigError, preset
-from kslc_jax.training import checkpoint, checkpoint_process, loop, recorder, run_folder
+from kslc_jax.training import checkpoint, checkpoint_process, loop, recorder, run_folder, starting
 from kslc_jax.training.logs import MetricsFile, Progress
 
 DEBUG = ["--preset", "debug"]
@@ -186,7 +186,7 @@ def test_a_training_starts_from_a_policy(whole, tmp_path, capsys):
     old = dataclasses.replace(old, curriculum=old.curriculum.replace(v_max=jnp.asarray(2.5)))
     policy_lib.save_policy(old, tmp_path / "p")
     init, _ = train_step.make(preset("debug"))
-    begin, origin = loop._starting_from(
+    begin, origin = starting.from_policy(
         tmp_path / "p", preset("debug"), init, checkpoint_process.LocalStorage(), None
     )
     state = begin()

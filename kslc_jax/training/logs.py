@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 from rich import box
 from rich.console import Console
 from rich.live import Live
@@ -196,3 +197,49 @@ class Progress:
         both = Table.grid(padding=(0, 1))
         both.add_row(head, table)
         return both
+
+
+class SeedsProgress(Progress):
+    """Shows the median, the lowest and the highest value of each metric over the seeds."""
+
+    def __init__(self, config: Config, console: Console | None = None):
+        super().__init__(config, console)
+        self.records: list[dict[str, float]] = []
+        """The latest record of each seed that trains."""
+        self.stopped: list[str] = []
+        """Names of the seeds whose numbers went bad."""
+
+    def _columns(self) -> list[dict[str, float]]:
+        names = self.records[0]
+        values = {name: [record[name] for record in self.records] for name in names}
+        return [{n: float(f(v)) for n, v in values.items()} for f in (np.median, min, max)]
+
+    def _title(self) -> str:
+        rate = sum(record["steps_per_second"] for record in self.records)
+        stopped = f"; stopped: {', '.join(self.stopped)}" if self.stopped else ""
+        count = len(self.records)
+        return f"{count} seed{'s' * (count > 1)}, {rate:.0f} steps/s in all{stopped}"
+
+    def _line(self, record: dict[str, float]) -> str:
+        middle, low, high = map(self._headline, self._columns())
+        said = [
+            f"{name} {text}"
+            + (f" ({low[name]} to {high[name]})" if low[name] != high[name] else "")
+            for name, text in middle.items()
+        ]
+        return "  ".join([self._title(), *said])
+
+    def _table(self, record: dict[str, float]) -> Table:
+        table = Table(box=box.SIMPLE_HEAD, title=self._title(), title_justify="left")
+        for column in ("metric", "median", "lowest", "highest"):
+            table.add_column(column, justify="left" if column == "metric" else "right")
+        columns = self._columns()
+        heads = [self._headline(column) for column in columns]
+        for name in heads[0]:
+            table.add_row(name, *(head[name] for head in heads))
+        weights = self.config.rewards.weights
+        for name in columns[0]:
+            term = name.removeprefix("reward/")
+            if term != name and getattr(weights, term) != 0:
+                table.add_row(term, *(f"{column[name]:.4g}" for column in columns))
+        return table

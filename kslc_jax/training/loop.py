@@ -7,36 +7,31 @@ to the others.
 """
 
 import contextlib
-import functools
 import os
 import shlex
 import time
-import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from kslc_jax import config as config_lib
 from kslc_jax import files, physics, train_step
-from kslc_jax.checkpoint_format import identity
-from kslc_jax.config import Config, ConfigError
-from kslc_jax.curriculum import Curriculum
-from kslc_jax.fingerprint import changes, fingerprint
-from kslc_jax.networks import Params
-from kslc_jax.policy import policy_name
+from kslc_jax.config import Config
 from kslc_jax.runtime import Watchdog
 from kslc_jax.train_step import TrainState
-from kslc_jax.training import devices, memory, profiling, recovery, run_folder, wandb_run
+from kslc_jax.training import devices, memory, profiling, recovery, run_folder, starting
+from kslc_jax.training import recorder as recorder_lib
+from kslc_jax.training import seeds as seeds_lib
 from kslc_jax.training.checkpoint_process import ChildProcessStorage, LocalStorage
 from kslc_jax.training.logs import Progress
-from kslc_jax.training.recorder import NullRecorder, Record, Recorder, snapshot_due
-from kslc_jax.training.recovery import NonFiniteState, NumbersError, NumericsCheck
-from kslc_jax.training.run_folder import locked, open_folder, writing
+from kslc_jax.training.recorder import NullRecorder, Record
+from kslc_jax.training.recovery import NonFiniteState, NumbersError
 from kslc_jax.training.stopping import stop_requests
 
 
@@ -70,6 +65,7 @@ def train(
     mesh: Mesh | None = None,
     profile: int = 0,
     wandb: bool = False,
+    seeds: int = 1,
 ) -> TrainState:
     """Trains until `config.run.steps` or a signal. Saves every few minutes and at the end.
 
@@ -82,6 +78,8 @@ def train(
       mesh: the devices of all processes, see `devices.mesh`; None for one device.
       profile: number of train steps to trace, see `profiling`.
       wandb: True: also send the records to Weights & Biases, see `wandb_run`.
+      seeds: number of trainings in one program, see `seeds`. More than 1 excludes `start_from`,
+        `mesh`, `profile` and `wandb`; the state then has a leading axis of seeds.
 
     Raises:
       RunError, ConfigError, CheckpointError: the training cannot start, or its last state cannot be
@@ -90,22 +88,24 @@ def train(
       NumbersError: numbers went bad in all attempts, or no train step learnt anything.
       Elsewhere: the first process raised one of these, and this is another process.
     """
-    init, step = train_step.make(config) if mesh is None else devices.make(config, mesh)
+    init, step = _program(config, mesh, seeds)
     like = jax.eval_shape(init)
-    memory.check(config, 1 if mesh is None else mesh.size)
+    count = 1 if mesh is None else mesh.size
+    memory.check(config, count, seeds)
     with contextlib.ExitStack() as stack:
         stack.enter_context(contextlib.closing(progress))
         storage = (
             ChildProcessStorage() if devices.several() and devices.is_first() else LocalStorage()
         )
         stack.enter_context(contextlib.closing(storage))
-        origin: dict[str, str] = {}
+        facts = run_folder.circumstances(config, count, seeds)
         if start_from is not None:
-            init, origin = _starting_from(start_from, config, init, storage, mesh)
-        facts = run_folder.circumstances(config, 1 if mesh is None else mesh.size) | origin
+            init, origin = starting.from_policy(start_from, config, init, storage, mesh)
+            facts |= origin
+        opened = seeds_lib.opened(seeds) if seeds > 1 else recorder_lib.opened
         recorder = devices.on_first(
             lambda: stack.enter_context(
-                _recorder(config, run_dir, resume, facts, progress, storage, wandb)
+                opened(config, run_dir, resume, facts, progress, storage, wandb)
             )
         )
         tracing = profiling.Profile(
@@ -120,73 +120,16 @@ def train(
         )
 
 
-@contextlib.contextmanager
-def _recorder(
-    config: Config,
-    run_dir: Path,
-    resume: bool,
-    facts: dict[str, Any],
-    progress: Progress,
-    storage: LocalStorage,
-    wandb: bool,
-) -> Generator[Recorder]:
-    """Opens the run folder and locks it for this process."""
-    if wandb:
-        wandb_run.package()  # before anything is written
-    if not resume:
-        with writing(run_dir):
-            run_dir.mkdir(parents=True, exist_ok=True)
-    with locked(run_dir), contextlib.ExitStack() as stack:
-        open_folder(run_dir, config, resume, facts)
-        with writing(run_dir):
-            store = stack.enter_context(contextlib.closing(storage.open(run_dir, config)))
-        online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if wandb else None
-        run = stack.enter_context(online) if online else None
-        yield Recorder(config, run_dir, store, progress, storage.save_policy, run)
+def _program(config: Config, mesh: Mesh | None, seeds: int) -> tuple[Callable[[], TrainState], Any]:
+    """(init, train_step) of one training, on one device or on a mesh, or of several seeds."""
+    if seeds > 1:
+        return seeds_lib.make(config, seeds)
+    return train_step.make(config) if mesh is None else devices.make(config, mesh)
 
 
-def _starting_from(
-    path: Path,
-    config: Config,
-    init: Callable[[], TrainState],
-    storage: LocalStorage,
-    mesh: Mesh | None,
-) -> tuple[Callable[[], TrainState], dict[str, str]]:
-    """`init` with a policy's networks and curriculum, and a note of their origin."""
-    start = functools.partial(train_step.start_from, config)
-    like = jax.eval_shape(init)
-    step = 0
-
-    def chosen() -> tuple[Params, Curriculum]:
-        nonlocal step
-        policy = storage.load_policy(path)
-        step = policy.step
-        theirs, ours = (identity(c.physics.robot) for c in (policy.config, config))
-        if theirs != ours:
-            raise ConfigError(
-                f"cannot start from {path}: it is of the robot {theirs['name']}, not of "
-                f"{ours['name']}, or its joints have another order"
-            )
-        if policy.config.physics.robot != config.physics.robot and (
-            changed := changes(policy.robot or {}, fingerprint(config.physics.robot))
-        ):
-            warnings.warn(f"{path} was trained with another robot: {changed}", stacklevel=2)
-        try:
-            jax.eval_shape(start, like, policy.params, policy.curriculum)
-        except ValueError as error:
-            raise ConfigError(
-                f"cannot start from {path}: it has {error}, see network and env.frames in its "
-                "config"
-            ) from error
-        return policy.params, policy.curriculum
-
-    params, curriculum = devices.from_first(chosen, (like.learner.params, like.curriculum))
-
-    def begin() -> TrainState:
-        state = start(init(), params, curriculum)
-        return state if mesh is None else devices.place(mesh, state)
-
-    return begin, {"start_from": f"{policy_name(path)}, train step {step}"}
+def _done(state: TrainState) -> int:
+    """Train steps done; of several seeds, by the one that has done the fewest."""
+    return int(np.asarray(state.step).min())
 
 
 def _train(job: _Job) -> TrainState:
@@ -194,10 +137,10 @@ def _train(job: _Job) -> TrainState:
     start = time.monotonic()
     if job.resume:
         state = job.restored()
-        if int(state.step) >= job.config.num_updates:
-            job.progress.say(_nothing_to_do(job, int(state.step)))
+        if _done(state) >= job.config.num_updates:
+            job.progress.say(_nothing_to_do(job, _done(state)))
             return state
-        job.progress.say(f"resumed at train step {int(state.step)}; compiling the train step")
+        job.progress.say(f"resumed at train step {_done(state)}; compiling the train step")
         compiled = _compiled(job)
     else:
         job.progress.say("compiling the first state and the train step")
@@ -212,7 +155,7 @@ def _train(job: _Job) -> TrainState:
                 return _loop(job, state, compiled)
             except NonFiniteState as bad:
                 state, attempt = _go_back(job, bad, attempt, back_to)
-                back_to = int(state.step)
+                back_to = _done(state)
 
 
 def _compiled(job: _Job) -> Any:
@@ -239,7 +182,7 @@ def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tupl
     """
     before = devices.whole(bad.before)
     state = _last_good(job)
-    attempt = attempt + 1 if int(state.step) == back_to else 1
+    attempt = attempt + 1 if _done(state) == back_to else 1
     if attempt > recovery.ATTEMPTS:
         folder = job.run_dir if devices.is_first() else Path(os.devnull)
         left = recovery.leave(job.config, folder / files.BAD_STATE, before)
@@ -249,7 +192,7 @@ def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tupl
         ) from bad
     state = recovery.with_lower_rate(state, attempt)
     job.progress.warn(
-        f"{bad}; back to train step {int(state.step)} with learning rate "
+        f"{bad}; back to train step {_done(state)} with learning rate "
         f"{float(state.learner.learning_rate):.2g} (attempt {attempt} of {recovery.ATTEMPTS})"
     )
     return state, attempt
@@ -260,15 +203,15 @@ def _last_good(job: _Job) -> TrainState:
     job.recorder.settle()
     (there,) = devices.agree(job.recorder.has_checkpoints())
     state = job.restored() if there else job.init()
-    job.recorder.drop_snapshots(int(state.step))
+    job.recorder.drop_snapshots(_done(state))
     return state
 
 
 def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
     """Trains step by step; saves and returns the last state."""
-    first = int(state.step)
+    first = _done(state)
     record: Record = {}
-    numerics, watchdog = NumericsCheck(state), Watchdog()
+    numerics, watchdog = job.recorder.check(state), Watchdog()
     with stop_requests() as stop, contextlib.ExitStack() as opened:
         devices.on_first(lambda: opened.enter_context(job.recorder.at(first)))
         for step in range(first + 1, job.config.num_updates + 1):
@@ -276,13 +219,13 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
             with job.profile.step(step), watchdog.step():
                 tick = time.monotonic()
                 state, metrics = step_fn(state)
-                record = {name: float(value) for name, value in jax.device_get(metrics).items()}
+                metrics = jax.device_get(metrics)
                 took = time.monotonic() - tick
-            record = job.recorder.log(record, step, took)
+            record = job.recorder.log(metrics, step, took)
             if warning := numerics.after(record):
                 job.progress.warn(warning)
-            if numerics.good and snapshot_due(job.config, step):
-                job.recorder.keep_snapshot(state)
+            if numerics.good:
+                job.recorder.keep_snapshot(state, step)
             stopped, due = devices.agree(stop.requested is not None, job.recorder.due())
             if stopped:
                 stop.requested = stop.requested or "a signal to another process"
@@ -295,7 +238,7 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
             devices.on_first(lambda: job.recorder.finish(last, record))
     if not stop.requested:
         numerics.require_some_good()
-    _farewell(job, int(state.step), stop.requested, numerics.finite)
+    _farewell(job, _done(state), stop.requested, numerics.finite)
     return state
 
 
@@ -319,7 +262,7 @@ def _nothing_to_do(job: _Job, step: int) -> str:
     )
 
 
-def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
+def describe(config: Config, run_dir: Path, mesh: Mesh | None = None, seeds: int = 1) -> str:
     """Describes the coming training: its size, engine, devices, memory and folder."""
     n, t = config.env.num_envs, config.ppo.rollout_steps
     engine, kind = physics.resolve_engine(config.physics), jax.devices()[0].device_kind
@@ -327,11 +270,12 @@ def describe(config: Config, run_dir: Path, mesh: Mesh | None = None) -> str:
     on = kind if jax.device_count() == 1 else f"{count} of {jax.device_count()} devices ({kind})"
     if devices.several():
         on += f", {jax.process_count()} processes"
-    need = memory.estimate(config, count)
+    need = memory.estimate(config, count) * seeds
+    each = f"{seeds} seeds, each with " if seeds > 1 else ""
     robot = config.physics.robot
     copied = f", robot {robot}" if config_lib.is_description(robot) else ""
     return (
-        f"{n} environments x {t} steps = {config.batch_size} samples an update, "
+        f"{each}{n} environments x {t} steps = {config.batch_size} samples an update, "
         f"{config.run.steps / 1e6:.2f}M steps in all; engine {engine} on {on}, about "
         f"{memory.shown(need)} of memory{' each' * (count > 1)}; run folder {run_dir}{copied}"
     )

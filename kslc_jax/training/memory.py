@@ -103,13 +103,13 @@ def shown(size: float) -> str:
     return f"{number:.{1 if number < 10 else 0}f} {unit}"
 
 
-def check(config: Config, devices: int = 1) -> None:
-    """ConfigError if a training does not fit into the memory of its devices."""
+def check(config: Config, devices: int = 1, seeds: int = 1) -> None:
+    """ConfigError if a training, or `seeds` of them, do not fit into the memory of the devices."""
     device = jax.local_devices()[0]
     memory = (device.memory_stats() or {}).get("bytes_limit")
     state, *_ = shapes(config)
     before = _bytes(state.env) / devices + _bytes(state.learner)  # the loop keeps a copy
-    need = estimate(config, devices) + before
+    need = seeds * (estimate(config, devices) + before)
     if memory is None:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") - PROCESS
     if need > memory:

@@ -10,17 +10,19 @@ import shutil
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
+from typing import Any
 
 from kslc_jax import files, policy
 from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.config import Config
 from kslc_jax.policy import Policy
 from kslc_jax.train_step import TrainState
-from kslc_jax.training import checkpoint
+from kslc_jax.training import checkpoint, wandb_run
 from kslc_jax.training.checkpoint import BEST_METRIC
-from kslc_jax.training.checkpoint_process import CheckpointStore
+from kslc_jax.training.checkpoint_process import CheckpointStore, LocalStorage
 from kslc_jax.training.logs import MetricsFile, Progress
-from kslc_jax.training.run_folder import writing
+from kslc_jax.training.recovery import NumericsCheck
+from kslc_jax.training.run_folder import locked, open_folder, writing
 from kslc_jax.training.wandb_run import WandbRun
 
 Record = dict[str, float]
@@ -33,9 +35,13 @@ class NullRecorder:
         """Context of a loop that begins after train step `step`."""
         return contextlib.nullcontext()
 
-    def log(self, metrics: Record, step: int, took: float) -> Record:
+    def check(self, state: TrainState) -> NumericsCheck:
+        """Checks the numbers of a loop that begins with `state`."""
+        return NumericsCheck(state)
+
+    def log(self, metrics: dict[str, Any], step: int, took: float) -> Record:
         """Shows and writes the metrics of a train step that took `took` seconds; returns them."""
-        return metrics
+        return {name: float(value) for name, value in metrics.items()}
 
     def has_checkpoints(self) -> bool:
         """True if there is a checkpoint to go back to."""
@@ -52,8 +58,8 @@ class NullRecorder:
     def save(self, state: TrainState, record: Record) -> None:
         """Writes a checkpoint in the background."""
 
-    def keep_snapshot(self, state: TrainState) -> None:
-        """Writes a snapshot: the policy alone."""
+    def keep_snapshot(self, state: TrainState, step: int) -> None:
+        """Writes a snapshot, the policy alone, if one is due after train step `step`."""
 
     def drop_snapshots(self, after: int) -> None:
         """Removes the snapshots of later train steps than `after`; the training went back to it."""
@@ -94,8 +100,8 @@ class Recorder(NullRecorder):
         with contextlib.closing(self._file):
             yield
 
-    def log(self, metrics: Record, step: int, took: float) -> Record:
-        batch = self._config.batch_size
+    def log(self, metrics: dict[str, Any], step: int, took: float) -> Record:
+        metrics, batch = super().log(metrics, step, took), self._config.batch_size
         record = metrics | {
             "step": step,
             "env_steps": step * batch,
@@ -127,11 +133,11 @@ class Recorder(NullRecorder):
             self.settle()
         self._saved = time.monotonic()
 
-    def keep_snapshot(self, state: TrainState) -> None:
-        """Writes a snapshot, unless one of this train step is there from before a resume."""
-        folder = self._run_dir / files.SNAPSHOTS / str(int(state.step))
+    def keep_snapshot(self, state: TrainState, step: int) -> None:
+        """Writes a snapshot that is due, unless it is there from before a resume."""
+        folder = self._run_dir / files.SNAPSHOTS / str(step)
         with self._going_on():
-            if not folder.exists():
+            if snapshot_due(self._config, step) and not folder.exists():
                 self._save_policy(checkpoint.policy_of(self._config, state), folder)
 
     def drop_snapshots(self, after: int) -> None:
@@ -155,6 +161,31 @@ class Recorder(NullRecorder):
             yield
         except CheckpointError as error:
             self._progress.warn(f"{error}; training goes on")
+
+
+@contextlib.contextmanager
+def opened(
+    config: Config,
+    run_dir: Path,
+    resume: bool,
+    facts: dict[str, Any],
+    progress: Progress,
+    storage: LocalStorage,
+    wandb: bool,
+) -> Generator[Recorder]:
+    """Opens the run folder and locks it for this process."""
+    if wandb:
+        wandb_run.package()  # before anything is written
+    if not resume:
+        with writing(run_dir):
+            run_dir.mkdir(parents=True, exist_ok=True)
+    with locked(run_dir), contextlib.ExitStack() as stack:
+        open_folder(run_dir, config, resume, facts)
+        with writing(run_dir):
+            store = stack.enter_context(contextlib.closing(storage.open(run_dir, config)))
+        online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if wandb else None
+        run = stack.enter_context(online) if online else None
+        yield Recorder(config, run_dir, store, progress, storage.save_policy, run)
 
 
 def snapshot_due(config: Config, step: int) -> bool:

@@ -162,10 +162,10 @@ RESUMED = "resumed"
 entries are those of the training's start."""
 
 
-def circumstances(config: Config, devices: int) -> dict[str, Any]:
+def circumstances(config: Config, devices: int, seeds: int = 1) -> dict[str, Any]:
     """Everything besides the config that can change the bits of a training."""
     engine = physics.resolve_engine(config.physics)
-    return versions() | {"engine": engine, "devices": devices}
+    return versions() | {"engine": engine, "devices": devices, "seeds": seeds}
 
 
 def what_changed(run_dir: Path, facts: dict[str, Any]) -> str:
@@ -186,7 +186,8 @@ def _news(run_dir: Path, facts: dict[str, Any]) -> dict[str, Any]:
 
 def _last_known(run_dir: Path) -> dict[str, Any]:
     """The circumstances under which the training last ran."""
-    known = _stored_versions(run_dir)
+    known: dict[str, Any] = {"seeds": 1}  # older files do not say it
+    known |= _stored_versions(run_dir)
     for later in known.pop(RESUMED, []):
         known |= later
     return known
