@@ -79,16 +79,15 @@ def reset(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
     joints = jax.random.uniform(keys[0], (robot.count,), minval=-noise, maxval=noise)
     qpos = jnp.asarray(robot.default_qpos, jnp.float32).at[7:].add(joints)
     state = physics.initial_state(config.physics, qpos, jnp.zeros(robot.mj_model.nv))
-    dynamics = randomize.sample(config.randomize, robot, keys[2])
+    uneven = None
     if config.physics.uneven:
         key_ground = jax.random.fold_in(key, len(keys))
-        drawn = ground.sample(config.physics.uneven, key_ground, curriculum.v_max)
-        dynamics = dynamics.replace(ground=drawn)
-    now = signals.read(robot, state, dynamics.ground)
+        uneven = ground.sample(config.physics.uneven, key_ground, curriculum.v_max)
+    now = signals.read(robot, state, uneven)
     command = _sample_command(config, keys[1], curriculum, now)
     blank = EnvState(
         physics=state,
-        dynamics=dynamics,
+        dynamics=randomize.sample(config.randomize, robot, keys[2]).replace(ground=uneven),
         gait=gait.init(config.gait, keys[3], command, now.foot_pos[:, 2]),
         command=command,
         command_since=jnp.zeros((), jnp.int32),
