@@ -203,26 +203,30 @@ def init(config: Config, key: jax.Array) -> Params:
     return params
 
 
-def policy(config: Config, params: Params, history: jax.Array) -> Gaussian:
-    """Action distribution for actor histories [..., K, W]."""
-    return policy_and_estimate(config, params, history)[0]
+def policy(
+    config: Config, params: Params, history: jax.Array, velocity: jax.Array | None = None
+) -> Gaussian:
+    """Action distribution for actor histories [..., K, W].
 
-
-def policy_and_estimate(
-    config: Config, params: Params, history: jax.Array
-) -> tuple[Gaussian, jax.Array | None]:
-    """(action distribution, estimated base velocity [..., 3]) for actor histories [..., K, W].
-
-    The estimate is scaled as in the critic's frame; it is None without an estimator. No gradient
-    flows from the actor into the estimator.
+    With an estimator, the actor also reads the base's `velocity` [..., 3], as `estimate` returns
+    it. None: it is estimated here. No gradient flows from the actor into the estimator.
     """
-    estimate, beside = None, ()
+    beside = ()
     if config.network.estimator:
-        variables = {"params": params["estimator"]}
-        estimate = cast(jax.Array, _estimator(config).apply(variables, history))
-        beside = (jax.lax.stop_gradient(estimate),)
+        velocity = estimate(config, params, history) if velocity is None else velocity
+        beside = (jax.lax.stop_gradient(velocity),)
     mean = cast(jax.Array, _actor(config).apply({"params": params["actor"]}, history, *beside))
-    return Gaussian(mean, log_std(config, params)), estimate
+    return Gaussian(mean, log_std(config, params))
+
+
+def estimate(config: Config, params: Params, history: jax.Array) -> jax.Array | None:
+    """Estimated velocity of the base [..., 3] for actor histories [..., K, W].
+
+    It is scaled as in the critic's frame. None without an estimator.
+    """
+    if not config.network.estimator:
+        return None
+    return cast(jax.Array, _estimator(config).apply({"params": params["estimator"]}, history))
 
 
 def log_std(config: Config, params: Params) -> jax.Array:

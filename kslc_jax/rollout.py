@@ -29,6 +29,7 @@ class Trajectory:
     age: jax.Array  # [T, N] int, control steps since the reset, before the step
     frame: jax.Array  # [T, N, W] newest actor frame, before the step
     privileged: jax.Array  # [T, N, W] newest critic frame, before the step
+    velocity: jax.Array | None  # [T, N, 3] estimate that the actor read, see networks.estimate
     outcome: Outcome  # [T, N]
 
 
@@ -60,7 +61,8 @@ def control_step(
 ) -> tuple[EnvState, Trajectory]:
     """One control step of N environments, unmasked. The trajectory is one row, [N, ...]."""
     key_act, key_env = jax.random.split(key)
-    dist = networks.policy(config, params, envs.history)
+    velocity = networks.estimate(config, params, envs.history)
+    dist = networks.policy(config, params, envs.history, velocity)
     action = dist.sample(key_act)
     keys = jax.random.split(key_env, config.env.num_envs)
     step = functools.partial(env.step, simulate=simulate)
@@ -73,6 +75,7 @@ def control_step(
         age=envs.time,
         frame=envs.history[:, -1],
         privileged=envs.privileged_history[:, -1],
+        velocity=velocity,
         outcome=outcome,
     )
 

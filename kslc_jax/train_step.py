@@ -163,20 +163,24 @@ def _observer(
 ) -> ppo.PolicyAtIndex:
     """Function that evaluates the networks at observations of `traj`, given by index t * N + n.
 
-    `start` holds the environments before the rollout.
+    `start` holds the environments before the rollout. The estimated velocity is an input of the
+    actor, so the update uses the estimates of the rollout. New ones would move the actions with
+    every gradient step of the estimator. The KL divergence would count that, and the learning rate
+    would fall to a third.
     """
     actor = windows(start.history, traj.frame, traj.age)
     critic = windows(start.privileged_history, traj.privileged, traj.age)
     table = observations.critic_table(physics.robot_for(config.physics))
-    velocity = observations.slices(table)["base_linvel"]
+    at = observations.slices(table)["base_linvel"]
+    read = None if traj.velocity is None else traj.velocity.reshape(-1, networks.ESTIMATED)
 
     def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array, jax.Array]:
         index = shard_index(index)
-        dist, estimate = networks.policy_and_estimate(config, params, actor(index))
-        seen = critic(index)
-        error = jnp.zeros(index.shape)
+        history, seen = actor(index), critic(index)
+        dist = networks.policy(config, params, history, None if read is None else read[index])
+        estimate, error = networks.estimate(config, params, history), jnp.zeros(index.shape)
         if estimate is not None:
-            error = jnp.sum(jnp.square(estimate - seen[:, -1, velocity]), axis=-1)
+            error = jnp.sum(jnp.square(estimate - seen[:, -1, at]), axis=-1)
         return dist, networks.value(config, params, seen), error
 
     return apply

@@ -110,8 +110,8 @@ def test_the_estimate_mirrors_and_only_its_own_error_trains_it():
     does not reach the estimator."""
     params = perturbed(CONFIG)
     history = jax.random.normal(KEY, (CONFIG.env.frames, observations.actor_width(XBOT)))
-    here = networks.policy_and_estimate(CONFIG, params, history)[1]
-    there = networks.policy_and_estimate(CONFIG, params, mirrored(ACTOR, history))[1]
+    here = networks.estimate(CONFIG, params, history)
+    there = networks.estimate(CONFIG, params, mirrored(ACTOR, history))
     np.testing.assert_allclose(there, here * np.array([1.0, -1.0, 1.0]), atol=1e-6)
     assert np.abs(here).min() > 1e-3
 
@@ -122,6 +122,8 @@ def test_the_estimate_mirrors_and_only_its_own_error_trains_it():
     assert all(not x.any() for x in jax.tree.leaves(grads["estimator"]))
     other = {**params, "estimator": jax.tree.map(lambda x: x + 0.1, params["estimator"])}
     assert abs(act(other) - act(params)) > 1e-4
+    given = networks.policy(CONFIG, other, history, here).mean
+    np.testing.assert_allclose(given, networks.policy(CONFIG, params, history).mean, atol=1e-6)
 
 
 def test_without_an_estimator_nothing_is_estimated():

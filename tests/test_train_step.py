@@ -149,7 +149,10 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     config, init, _ = made
 
     def update(ppo_config, apply, constants, learner, samples, key):
-        return learner, {"samples": samples, "seen": apply(learner.params, samples.index)}
+        params, seen = learner.params, apply(learner.params, samples.index)
+        other = params | {"estimator": jax.tree.map(lambda x: x + 0.1, params["estimator"])}
+        later = apply(other, samples.index)  # as after a gradient step
+        return learner, {"samples": samples, "seen": seen, "later": later}
 
     monkeypatch.setattr(train_step.ppo, "update", update)
     monkeypatch.setattr(
@@ -170,6 +173,9 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     dist, value, _ = got["seen"]
     np.testing.assert_allclose(dist.mean, got["samples"].mean, atol=1e-5)
     np.testing.assert_allclose(value, got["samples"].value, atol=1e-5)
+    # The actor reads the estimates of the rollout: a better estimator moves no action.
+    np.testing.assert_allclose(got["later"][0].mean, got["samples"].mean, atol=1e-5)
+    assert np.abs(got["later"][2] - got["seen"][2]).max() > 0.01
     log_prob = dist.log_prob(got["samples"].action)
     np.testing.assert_allclose(log_prob, got["samples"].log_prob, atol=1e-3)
     samples, out = jax.tree.map(np.asarray, (got["samples"], got["outcome"]))
