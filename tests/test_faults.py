@@ -450,11 +450,12 @@ class TestResume:
     @pytest.fixture
     def done(self, training, capsys):
         """Goes on with a training of 8 train steps, 1024 environment steps; what it says."""
-        assert training(lambda state: state) == 0
+        rarely = ("--run.checkpoint-minutes", 60)  # each checkpoint takes most of a second
+        assert training(lambda state: state, *rarely) == 0
 
         def resume(*args, code=0):
             capsys.readouterr()
-            assert training(lambda state: state, "--resume", *args) == code
+            assert training(lambda state: state, *rarely, "--resume", *args) == code
             said = capsys.readouterr()
             return said.err if code else said.out
 

@@ -7,6 +7,7 @@ the shapes of the program. The constants below come from XLA's buffer assignment
 docs/performance.md compares the estimate with measurements.
 """
 
+import dataclasses
 import functools
 import os
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import jax
 
 from kslc_jax import physics, rollout, train_step
-from kslc_jax.config import Config, ConfigError
+from kslc_jax.config import Config, ConfigError, RunConfig
 from kslc_jax.ppo import Samples
 from kslc_jax.rollout import Trajectory
 from kslc_jax.train_step import TrainState
@@ -48,13 +49,16 @@ def estimate(config: Config, devices: int = 1) -> int:
     return round(environments + networks + max(in_rollout, in_update))
 
 
-@functools.lru_cache(maxsize=8)
 def shapes(config: Config) -> tuple[TrainState, Trajectory, Samples]:
-    """Shapes of the state, of a rollout and of its samples.
+    """Shapes of the state, of a rollout and of its samples (cached; seed and run do not matter).
 
     The traced program leaves the physics out: it takes long to trace, and changes no shape.
     """
+    return _shapes(dataclasses.replace(config, seed=0, run=RunConfig()))
 
+
+@functools.lru_cache(maxsize=8)
+def _shapes(config: Config) -> tuple[TrainState, Trajectory, Samples]:
     def one() -> tuple[TrainState, Trajectory, Samples]:
         state = train_step.init(config, 0)
         args = state.learner.params, state.env, state.curriculum, state.key
@@ -77,7 +81,8 @@ def _update(
     """Bytes of all frames and samples, which each device holds, and of a device's minibatch."""
     histories = state.env.history, state.env.privileged_history
     before = sum(_bytes(history) * (1 - 1 / history.shape[1]) for history in histories)
-    frames = _bytes((trajectory.frame, trajectory.privileged)) + before
+    read = trajectory.frame, trajectory.privileged, trajectory.velocity
+    frames = _bytes(read) + before
     window = _bytes(histories) / config.env.num_envs
     inputs = window * (2 if config.network.symmetric else 1)  # a copy in even and odd parts
     kept = NUMBER * KEPT_PER_UNIT * (sum(config.network.actor) + sum(config.network.critic))
