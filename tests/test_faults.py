@@ -736,7 +736,8 @@ class TestSchema:
         run = shutil.copytree(self.OLD, tmp_path / "run")
         assert train.main(["--resume", "--run-dir", str(run)]) == 2
         line = the_error(capsys)
-        assert "checkpoint schema 1, this kslc_jax goes on from 3" in line
+        ours = checkpoint_format.SCHEMA_VERSION
+        assert f"checkpoint schema 1, this kslc_jax goes on from {ours}" in line
         assert "--start-from" in line
         assert [p.name for p in (run / "checkpoints").iterdir()] == ["1"]
 
