@@ -548,7 +548,7 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
 def blank_renderer(monkeypatch):
     """Replaces the renderer by one that gives black pictures without GL."""
     blank = SimpleNamespace(
-        frames=lambda robot, qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos)
+        frames=lambda robot, qpos, ground: (np.zeros((480, 640, 3), np.uint8) for _ in qpos)
     )
     monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
     monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
@@ -558,7 +558,9 @@ def film_two_speeds(out: Path) -> None:
     """Writes half a second at 1 m/s and half a second at 2 m/s."""
     linvel, command = np.zeros((2, 150, 2, 3))
     linvel[..., 0], command[..., 0] = (0.9, 2.1), (1.0, 2.0)
-    trace = SimpleNamespace(qpos=np.zeros((150, 2, 23)), linvel=linvel, command=command)
+    trace = SimpleNamespace(
+        qpos=np.zeros((150, 2, 23)), linvel=linvel, command=command, ground=None
+    )
     films.write_video(out, robot.load("high"), trace, [range(100, 150)] * 2, dt=0.01)
 
 
