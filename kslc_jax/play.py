@@ -1,42 +1,52 @@
 """Watch a policy: python -m kslc_jax.play POLICY
 
-Opens a live viewer in the browser. Its sliders command the robot while it runs. With --follow the
-viewer takes each new policy of a running training. The options --gait-strip and --video draw off
-screen instead. --gait-strip draws the paper's gait figure: the robot every 0.25 s on a 1 m grid,
-one strip per speed. --video makes a film of one speed after the other. The default physics is C
-MuJoCo at high fidelity. Strips and films can also use Drake. POLICY is a run folder, a checkpoint
-folder, or the name of a shipped policy.
+Opens a live viewer in the browser. Its sliders command the robot while it runs, and a button shoves
+a link of the robot. With --follow the viewer takes each new policy of a running training. With
+--schedule the command changes by itself, until the user moves a slider or presses a key. --punch
+and --hold-arms disturb the robot as in kslc_jax.sim2sim. The options --gait-strip and --video draw
+off screen instead. --gait-strip draws the paper's gait figure: the robot every 0.25 s on a 1 m
+grid, one strip per speed. --video makes a film of one speed after the other. With --schedule both
+show the schedule from its start. The default physics is C MuJoCo at high fidelity. Strips and films
+can also use Drake. POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
+
+Examples:
+  python -m kslc_jax.play xbot_l_run
+  python -m kslc_jax.play runs/laptop-seed0 --follow
+  python -m kslc_jax.play xbot_l_run --schedule tour --ground rough:0.03
+  python -m kslc_jax.play xbot_l_run --schedule random --top 2 --punch 200 --hold-arms
+  python -m kslc_jax.play xbot_l_run --video stop.webp --schedule stop --top 2 --seconds 9
+  python -m kslc_jax.play xbot_l_run --gait-strip strip.png --speeds 1 2 3.5
 """
 
 import contextlib
+import functools
 import ipaddress
 import math
 import sys
-import warnings
-from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from kslc_jax import cli, files, runtime, sim2sim
-from kslc_jax.config import ConfigError, Fidelity, TerrainConfig, require_seed
+from kslc_jax.config import ConfigError, Fidelity, RandomizeConfig, TerrainConfig, require_seed
 from kslc_jax.errors import MissingPackage
 from kslc_jax.evaluation import perturbations
+from kslc_jax.viewer import films
 
-FPS = 50
+if TYPE_CHECKING:
+    from kslc_jax.evaluation.schedules import Schedule
+    from kslc_jax.policy import Policy
 
 STRIPS = (".png", ".jpg")
-FILMS = (".mp4", ".mkv", ".mov")
-ANIMATIONS = (".webp", ".gif")
-"""Suffixes of films that web pages show like pictures. They need no ffmpeg. They have half the
-frames."""
+"""Suffixes of gait strips."""
 
-QUALITY = 60
-"""Quality of an animation, 0 to 100. With it, six seconds take about 1 MB."""
+SETTLE_SECONDS = 4.0
+"""Time in which the robot gathers speed before a strip or video shows it [s]."""
 
-SPEED_SECONDS = 0.5
-"""Window for the mean speed that the video shows as text [s]."""
+SECONDS, SCHEDULE_SECONDS = 2.0, 10.0
+"""Time that strip and video show per speed; of a schedule [s]."""
 
 
 @dataclass(frozen=True)
@@ -62,10 +72,23 @@ class Args:
     ground: str | None = None
     """Uneven ground: rough:M (random waves of up to M metres up and down), slope:DEGREES or
     stairs:M (steps of M metres). The first 0.5 m are flat."""
+    schedule: str | None = None
+    """Commands that change: stop (top speed 5 s, rest 4 s), reverse (top speed 5 s, backwards 4 s),
+    box (a new command as in training every 4 s), random (the same every 1 to 4 s, with stops and
+    reversals from the top speed), jitter (as random, every 0.3 to 4 s), turns (at three speeds),
+    tour (way-points), or the path of a JSON file (kslc_jax.sim2sim --help describes it)."""
+    top: float | None = None
+    """Fastest command of the schedule [m/s]; None: the fastest command of the policy's training."""
+    punch: float = 0.0
+    """Force [N] for 0.08 s at a random link in a random direction every 4 s; the first one comes
+    2 s after the start."""
+    hold_arms: bool = False
+    """The arms follow random targets, at most 0.3 rad/s fast, in place of the policy's actions."""
     speeds: tuple[float, ...] = (2.0, 3.5)
-    """Commanded forward speeds of strip and video [m/s]."""
-    seconds: float = 2.0
-    """Time that strip and video show per speed. It starts after the robot has gathered speed."""
+    """Commanded forward speeds of strip and video [m/s]; --schedule replaces them."""
+    seconds: float | None = None
+    """Time that strip and video show. None: 2 s per speed, after 4 s in which the robot gathers
+    speed; or 10 s of a schedule, from its start."""
     gait_strip: Path | None = None
     """PNG or JPG to write: one strip per speed."""
     video: Path | None = None
@@ -73,18 +96,24 @@ class Args:
     (pip install 'kslc_jax[video]'). WEBP and GIF need no more packages."""
 
     def __post_init__(self):
-        if not 0 < self.seconds < math.inf:
+        if not 0 < self.shown_seconds < math.inf:
             raise ConfigError("seconds must be positive")
         if not (self.speeds and all(map(math.isfinite, self.speeds))):
             raise ConfigError("speeds: name at least one, finite")
         require_seed(self.seed)
-        for path, kinds in ((self.gait_strip, STRIPS), (self.video, FILMS + ANIMATIONS)):
+        perturbations.check_disturbances(self.punch, self.top)
+        if self.top is not None and self.schedule is None:
+            raise ConfigError("top is the fastest command of a schedule: give --schedule too")
+        videos = films.FILMS + films.ANIMATIONS
+        for path, kinds in ((self.gait_strip, STRIPS), (self.video, videos)):
             if path is not None and path.suffix.lower() not in kinds:
                 raise ConfigError(f"{path}: its name must end in {' or '.join(kinds)}")
         if self.engine != "mujoco" and self.fidelity != "high":
             raise ConfigError(f"engine: {self.engine} takes the robot at --fidelity high only")
         if self.terrain and self.engine != "mujoco":
             raise ConfigError(f"ground: {self.engine} has the flat floor only")
+        if self.punch and self.engine != "mujoco":
+            raise ConfigError(f"punch: {self.engine} knows no forces on links")
         if not 0 <= self.port < 2**16:
             raise ConfigError("port must lie in 0 to 65535")
         if self.follow and not self.live:
@@ -102,118 +131,60 @@ class Args:
         """Uneven ground; None: the flat floor."""
         return perturbations.terrain(self.ground) if self.ground else None
 
+    @property
+    def shown_seconds(self) -> float:
+        """Time that strip and video show [s]."""
+        if self.seconds is not None:
+            return self.seconds
+        return SECONDS if self.schedule is None else SCHEDULE_SECONDS
+
+
+def plan(args: Args, policy: "Policy") -> "Schedule | None":
+    """The schedule of `args` for a policy. ConfigError if there is no such schedule."""
+    from kslc_jax.evaluation import schedules
+
+    if args.schedule is None:
+        return None
+    v_max = float(policy.curriculum.v_max)
+    return schedules.named(args.schedule, policy.config, v_max, args.top)
+
+
+def randomize(args: Args) -> RandomizeConfig:
+    """The disturbances of `args`."""
+    from kslc_jax.evaluation import trials
+
+    return perturbations.disturbed(trials.NOMINAL, args.punch, args.hold_arms)
+
 
 # ---------------------------------------------------------------------------------------- pictures
 
 
-def record(args: Args, policy, settle: float = 4.0):
-    """(trace [T, S, ...], number of steps in `settle` seconds, length of a control step [s])."""
+def record(args: Args, policy):
+    """(trace [T, S, ...], number of its first step to show, length of a control step [s]).
+
+    S is the number of speeds, or 1 for a schedule.
+    """
     import jax
     import numpy as np
 
     from kslc_jax.evaluation import trials
 
-    velocities = np.zeros((len(args.speeds), 3))
-    velocities[:, 0] = args.speeds
+    schedule = plan(args, policy)
+    speeds, settle = ((0.0,), 0.0) if schedule else (args.speeds, SETTLE_SECONDS)
+    velocities = np.zeros((len(speeds), 3))
+    velocities[:, 0] = speeds
     engine = trials.engine(policy, args.fidelity, args.terrain)
     setting = trials.Setting(
         engine,
-        seconds=settle + max(1.0, np.ceil(args.seconds)),
+        randomize(args),
+        seconds=settle + max(1.0, np.ceil(args.shown_seconds)),
         simulate=sim2sim.simulator(args.engine),
+        schedule=schedule,
     )
     trace = trials.join(list(trials.run(policy, setting, velocities, args.seed)))
     start = round(settle / engine.control_dt)
-    stop = start + round(args.seconds / engine.control_dt)
+    stop = start + round(args.shown_seconds / engine.control_dt)
     return jax.tree.map(lambda x: x[:stop], trace), start, engine.control_dt
-
-
-def shown(alive, start: int) -> range:
-    """The steps of one trial to show, from `alive` [T].
-
-    These are the steps from `start` on. If the robot fell, they are as many steps, or all if there
-    are fewer, up to its fall.
-    """
-    steps = len(alive)
-    fall = steps if alive[-1] else int(alive.argmin())
-    return range(max(0, fall - (steps - start)), fall) if fall else range(1)
-
-
-def caption(picture, text: str):
-    """The picture [H, W, 3] with `text` in its upper left corner."""
-    import numpy as np
-    from PIL import Image, ImageDraw, ImageFont
-
-    image = Image.fromarray(picture)
-    size = image.height // 20
-    ImageDraw.Draw(image).multiline_text(
-        (size, size),
-        text,
-        fill="white",
-        stroke_fill="black",
-        stroke_width=size // 10,
-        font=ImageFont.load_default(size),
-    )
-    return np.asarray(image)
-
-
-def film_writer():
-    """The module imageio. If it is missing, MissingPackage says what to install."""
-    try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401 (its own error is clearer than imageio's)
-    except ImportError as error:
-        raise MissingPackage(f"films: {error} (pip install 'kslc_jax[video]')") from error
-    return imageio
-
-
-def ground_of(trace, steps: range, trial: int):
-    """The ground [len(steps)] of one trial of the trace; None on the flat floor."""
-    import jax
-
-    return jax.tree.map(lambda x: x[steps, trial], trace.ground)
-
-
-def film(args: Args, robot, trace, spans: Sequence[range], every: int, dt: float) -> Iterator:
-    """Pictures [H, W, 3] of every `every`-th step of the spans, one speed after the other.
-
-    Each picture shows the commanded and the actual speed as text.
-    """
-    from kslc_jax.viewer import render
-
-    window = round(SPEED_SECONDS / dt)
-    for i, (command, steps) in enumerate(zip(args.speeds, spans, strict=True)):
-        filmed = steps[::every]
-        qpos, ground = trace.qpos[filmed, i], ground_of(trace, filmed, i)
-        pictures = render.frames(robot, qpos, ground=ground)
-        for step, picture in zip(filmed, pictures, strict=True):
-            speed = trace.linvel[max(0, step + 1 - window) : step + 1, i, 0].mean()
-            text = f"commanded {command:.1f} m/s\nactual {speed:.2f} m/s"
-            yield caption(picture, text)
-
-
-def write_video(path: Path, args: Args, robot, trace, spans: Sequence[range], dt: float) -> None:
-    """Writes the film, which plays in real time. The suffix of `path` decides the format."""
-    if path.suffix.lower() in ANIMATIONS:
-        every = max(1, round(2.0 / (FPS * dt)))
-        write_animation(path, film(args, robot, trace, spans, every, dt), every * dt)
-        return
-    imageio = film_writer()
-    # The warning is harmless here: the fork starts ffmpeg at once and runs no JAX.
-    warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
-    every = max(1, round(1.0 / (FPS * dt)))
-    with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as out:
-        for picture in film(args, robot, trace, spans, every, dt):
-            out.append_data(picture)
-
-
-def write_animation(path: Path, pictures: Iterable, seconds: float) -> None:
-    """Writes an animated WebP or GIF that repeats without end; each picture lasts `seconds`."""
-    from PIL import Image
-
-    first, *others = map(Image.fromarray, pictures)
-    milliseconds = round(1000 * seconds)
-    more = {"append_images": others, "duration": milliseconds, "loop": 0, "quality": QUALITY}
-    first.save(path, None, save_all=True, **more)
 
 
 def draw(args: Args, policy) -> None:
@@ -224,23 +195,24 @@ def draw(args: Args, policy) -> None:
 
     for path in (args.gait_strip, args.video):
         files.require_writable(path)
-    if args.video is not None and args.video.suffix.lower() in FILMS:
-        film_writer()
+    if args.video is not None and args.video.suffix.lower() in films.FILMS:
+        films.film_writer()
     trace, start, dt = record(args, policy)
     robot = render.shown_robot(policy, args.terrain)
-    for speed, up in zip(args.speeds, trace.alive[-1], strict=True):
+    tried = [args.schedule] if args.schedule else [f"{speed:g} m/s" for speed in args.speeds]
+    for name, up in zip(tried, trace.alive[-1], strict=True):
         if not up:
-            print(f"warning: fell at {speed:g} m/s; what is shown ends there")
-    spans = [shown(trace.alive[:, i], start) for i in range(len(args.speeds))]
+            print(f"warning: fell at {name}; what is shown ends there")
+    spans = [films.shown(trace.alive[:, i], start) for i in range(len(tried))]
     if args.gait_strip is not None:
         strips = [
-            render.gait_strip(robot, trace.qpos[span, i], dt, ground=ground_of(trace, span, i))
-            for i, span in enumerate(spans)
+            render.gait_strip(robot, trace.qpos[s, i], dt, ground=films.ground_of(trace, s, i))
+            for i, s in enumerate(spans)
         ]
         matplotlib.image.imsave(args.gait_strip, render.stack(strips))
         print(f"wrote {args.gait_strip}")
     if args.video is not None:
-        write_video(args.video, args, robot, trace, spans, dt)
+        films.write_video(args.video, robot, trace, spans, dt)
         print(f"wrote {args.video}")
 
 
@@ -266,7 +238,8 @@ def watch(args: Args) -> None:
         print(f"warning: {args.host} is not localhost; others on the network can open the viewer")
     with contextlib.suppress(KeyboardInterrupt):
         how = (args.fidelity, args.host, args.port, args.seed, args.follow, args.terrain)
-        viewer = Viewer(args.policy, *how)
+        made = functools.partial(plan, args)
+        viewer = Viewer(args.policy, *how, plan=made, randomize=randomize(args))
         host = "localhost" if is_local(args.host) else args.host
         print(f"viewer: http://{host}:{viewer.server.get_port()} (Ctrl-C ends it)", flush=True)
         viewer.run()

@@ -44,7 +44,14 @@ from kslc_jax import cli, evaluate, files
 from kslc_jax.config import ConfigError, PhysicsConfig, require_seed
 from kslc_jax.errors import MissingPackage
 from kslc_jax.evaluation import tables
-from kslc_jax.evaluation.perturbations import ALL, changes, settings, terrain
+from kslc_jax.evaluation.perturbations import (
+    ALL,
+    changes,
+    check_disturbances,
+    disturbed,
+    settings,
+    terrain,
+)
 
 if TYPE_CHECKING:
     from kslc_jax.evaluation.trials import Setting
@@ -123,10 +130,7 @@ class Args:
             raise ConfigError("heading: name at least one, finite")
         if not 0 <= self.latency <= MOST_LATENCY:
             raise ConfigError(f"latency must lie in 0 to {MOST_LATENCY} control steps")
-        if not (math.isfinite(self.punch) and self.punch >= 0):
-            raise ConfigError("punch must be a force in newtons, not negative")
-        if self.top is not None and not (math.isfinite(self.top) and self.top > 0):
-            raise ConfigError("top must be a positive speed")
+        check_disturbances(self.punch, self.top)
         for ground in self.ground:
             terrain(ground)
         for name in self.conditions:
@@ -173,10 +177,8 @@ def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
         heading=args.heading[0],
         simulate=simulator(args.engine),
     )
-    disturbed = dataclasses.replace(
-        plain.randomize, punch=(args.punch, args.punch), held_arms=float(args.hold_arms)
-    )
-    return dataclasses.replace(plain, **settings(made, disturbed))
+    randomize = disturbed(plain.randomize, args.punch, args.hold_arms)
+    return dataclasses.replace(plain, **settings(made, randomize))
 
 
 CONDITIONS = (

@@ -22,8 +22,8 @@ import kslc_jax.viewer
 from kslc_jax import config, curriculum, files, networks, play, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
-from kslc_jax.evaluation import trials
-from kslc_jax.viewer import following, session
+from kslc_jax.evaluation import schedules, trials
+from kslc_jax.viewer import films, following, session
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
 BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
@@ -91,14 +91,90 @@ def test_heading_is_kept_where_turning_ended(still):
     assert float(live._memory.env.command.heading) == pytest.approx(yaw, abs=0.01)
 
 
-def test_a_push_changes_the_base_velocity(still):
-    push = np.array([0.5, -0.3])
-    left, pushed = (session.Session(still, C_MUJOCO) for _ in range(2))
-    for _ in range(20):
+def in_the_air(live, yaw):
+    """Lifts the robot of a session by 5 m and turns it to the heading `yaw` [rad]."""
+    memory = live._memory
+    turn = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
+    qpos = memory.env.physics.qpos.at[2].add(5.0).at[3:7].set(np.array(turn))
+    lifted = memory.env.replace(physics=memory.env.physics.replace(qpos=qpos))
+    live._memory, live.view = memory.replace(env=lifted), live.view.replace(qpos=qpos)
+
+
+def velocity_of_mass(live):
+    """Velocity [3, m/s] of the centre of mass of the robot of a session, in the world frame."""
+    model, state = live._model, live._memory.env.physics
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state.qpos, state.qvel
+    mujoco.mj_forward(model, data)
+    mujoco.mj_subtreeVel(model, data)
+    return data.subtree_linvel[0].copy()
+
+
+@pytest.mark.parametrize(("link", "angle"), [("base_link", 0.0), ("left_knee_link", 2.0)])
+def test_a_shove_in_the_air_changes_the_velocity_by_force_times_time_by_mass(still, link, angle):
+    """At any link. The direction counts from the robot's heading, here 0.5 rad. The shove lasts
+    0.08 s of the 0.12 s."""
+    left, shoved = (session.Session(still, C_MUJOCO) for _ in range(2))
+    for live in (left, shoved):
+        in_the_air(live, yaw=0.5)
+    shoved.shove(link, 100.0, angle)
+    for _ in range(12):
         left.advance(np.zeros(3))
-        pushed.advance(np.zeros(3))
-    change = pushed.advance(np.zeros(3), push).velocity - left.advance(np.zeros(3)).velocity
-    np.testing.assert_allclose(change[:2], push, atol=0.15)
+        shoved.advance(np.zeros(3))
+    change = velocity_of_mass(shoved) - velocity_of_mass(left)
+    mass = robot.load("train").total_mass
+    way = np.array([np.cos(0.5 + angle), np.sin(0.5 + angle), 0.0])
+    np.testing.assert_allclose(change, 100.0 * 0.08 / mass * way, atol=2e-3)
+
+
+def test_a_shove_ends_with_the_episode(still):
+    live = session.Session(still, C_MUJOCO)
+    live.shove("base_link", 300.0, 0.0)
+    live.advance(np.zeros(3))
+    assert live._force.any()
+    live.reset()
+    assert not live._force.any()
+
+
+MINE = schedules.Schedule(
+    "mine",
+    top=0.5,
+    steps=(
+        schedules.Step(0.2, 0.5),
+        schedules.Step(0.2, 0.3, yaw_rate=0.4),
+        schedules.Step(0.2, 0.0, heading=0.3),
+    ),
+)
+VX = [0.5] * 20 + [0.3] * 20 + [0.0] * 20
+"""Commands of `MINE` in its 60 control steps [m/s]."""
+
+
+def test_a_session_follows_a_schedule_as_a_trial_does(still):
+    """A command of the user interrupts a leg. The next leg begins after it."""
+    trace = next(trials.run(still, trials.Setting(C_MUJOCO, schedule=MINE), np.zeros((1, 3))))
+    live = session.Session(still, C_MUJOCO, schedule=MINE)
+    views = [live.advance() for _ in range(70)]
+    np.testing.assert_allclose([v.qpos for v in views], trace.qpos[:70, 0], atol=2e-5)
+    np.testing.assert_allclose([v.command[0] for v in views], [*VX, *VX[:10]])
+    np.testing.assert_allclose(live.advance(np.array([0.4, 0.0, 0.1])).command, [0.4, 0.0, 0.1])
+    np.testing.assert_allclose(live.advance().command, [0.3, 0.0, 0.4])
+
+
+def test_a_fallen_robot_starts_the_schedule_anew(still):
+    live = session.Session(still, C_MUJOCO, schedule=MINE)
+    views = [live.advance() for _ in range(500)]
+    fell = next(i for i, v in enumerate(views) if v.fallen)
+    again = [v.command[0] for v in views[fell + 101 : fell + 161]]
+    np.testing.assert_allclose(again, VX)
+
+
+def test_a_session_has_the_disturbances_of_play(still):
+    args = play.Args(Path("x"), punch=300.0, hold_arms=True)
+    live = session.Session(still, C_MUJOCO, randomize=play.randomize(args))
+    assert live._memory.env.disturbances.arms_held
+    assert live._config.randomize == dataclasses.replace(
+        trials.NOMINAL, punch=(300.0, 300.0), held_arms=1.0
+    )
 
 
 def test_a_joystick_that_trembles_at_the_edge_of_the_dead_zone():
@@ -207,11 +283,48 @@ def test_panel(viewer):
     panel.allow(1.5)
     panel._stop()
     assert not panel.command.any()
-    rng = np.random.default_rng(0)
-    assert panel.take_push(rng) is None
-    panel._push_wanted.set()
-    assert np.hypot(*panel.take_push(rng)) == pytest.approx(panel._push.value)
-    assert panel.take_push(rng) is None
+
+
+def test_the_panel_chooses_a_shove(viewer):
+    """A click on a link selects it."""
+    panel, rng = viewer.panel, np.random.default_rng(0)
+    assert panel.take_shove(rng) is None
+    panel._shove_wanted.set()
+    first = panel.take_shove(rng)
+    assert first[:2] == ("base_link", panel._newtons.value) and panel.take_shove(rng) is None
+    panel._shove_wanted.set()
+    assert panel.take_shove(rng)[2] != first[2]  # another random direction
+    viewer.figure._choose("left_knee_link")
+    panel._direction.value = "left"
+    panel._shove_wanted.set()
+    assert panel.take_shove(rng) == ("left_knee_link", panel._newtons.value, np.pi / 2)
+    panel.offer(viewer.session.links)  # the same robot: the choice stays
+    assert panel._link.value == "left_knee_link"
+    panel.offer(("trunk", "hand"))
+    assert panel._link.value == "trunk"
+    panel.offer(viewer.session.links)
+    panel._direction.value = "random"
+
+
+def test_the_robot_follows_the_schedule_until_the_user_commands(viewer, monkeypatch):
+    """The sliders show its command. Their own movement is not the user's."""
+    box = viewer.server.gui.add_checkbox("Schedule mine", True)
+    monkeypatch.setattr(viewer.panel, "_schedule", box)
+    monkeypatch.setattr(viewer.session, "schedule", MINE)
+    monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: None})
+    viewer.reset()
+    viewer.frame(500.0)
+    viewer.frame(500.1)
+    assert viewer.panel.command is None
+    assert [s.value for s in viewer.panel._sliders] == [0.5, 0.0, 0.0]
+    viewer.panel._moved(SimpleNamespace(client=object()))
+    assert box.value is False and viewer.panel.command[0] == 0.5
+    box.value = True
+    viewer.panel._change(np.array([0.25, 0.0, 0.0]))  # a key: from the schedule's command on
+    viewer.frame(500.2)
+    assert viewer._recent[-1].command[0] == pytest.approx(0.75)
+    viewer.panel._stop()
+    viewer.reset()
 
 
 def test_frames_step_only_while_watched(viewer, monkeypatch):
@@ -384,6 +497,14 @@ def test_viewer_not_installed_is_one_line(run_dir, capsys, monkeypatch):
         (["x", "--seconds", "0"], "seconds must be positive"),
         (["x", "--follow", "--video", "x.mp4"], "follow is for the live viewer"),
         (["xbot_l_run", "--follow"], "xbot_l_run is no run folder of a training"),
+        (["x", "--punch", "-1"], "punch must be a force in newtons"),
+        (["x", "--top", "2"], "top is the fastest command of a schedule"),
+        (["x", "--schedule", "stop", "--top", "0"], "top must be a positive speed"),
+        (["xbot_l_run", "--schedule", "dance"], "schedule: no file 'dance' (known names: stop"),
+        (
+            ["x", "--engine", "drake", "--video", "x.gif", "--punch", "200"],
+            "punch: drake knows no forces on links",
+        ),
         (["x", "--engine", "drake"], "engine: drake is for --gait-strip and --video only"),
     ],
 )
@@ -404,7 +525,7 @@ def test_which_addresses_are_local(host, local):
 
 def test_caption_writes_into_the_corner():
     black = np.zeros((480, 640, 3), np.uint8)
-    written = play.caption(black, "commanded 2.0 m/s\nactual 1.95 m/s")
+    written = films.caption(black, "commanded 2.0 m/s\nactual 1.95 m/s")
     assert written.shape == black.shape and written[:100, :320].max() == 255
     assert not written[100:].any() and not written[:, 320:].any()
 
@@ -427,7 +548,7 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
 def blank_renderer(monkeypatch):
     """Replaces the renderer by one that gives black pictures without GL."""
     blank = SimpleNamespace(
-        frames=lambda robot, qpos: (np.zeros((480, 640, 3), np.uint8) for _ in qpos)
+        frames=lambda robot, qpos, ground: (np.zeros((480, 640, 3), np.uint8) for _ in qpos)
     )
     monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", blank)
     monkeypatch.setattr(kslc_jax.viewer, "render", blank, raising=False)
@@ -435,11 +556,12 @@ def blank_renderer(monkeypatch):
 
 def film_two_speeds(out: Path) -> None:
     """Writes half a second at 1 m/s and half a second at 2 m/s."""
-    args = play.Args(Path("x"), speeds=(1.0, 2.0), seconds=0.5)
-    linvel = np.zeros((150, 2, 3))
-    linvel[..., 0] = 0.9, 2.1
-    trace = SimpleNamespace(qpos=np.zeros((150, 2, 23)), linvel=linvel)
-    play.write_video(out, args, robot.load("high"), trace, [range(100, 150)] * 2, dt=0.01)
+    linvel, command = np.zeros((2, 150, 2, 3))
+    linvel[..., 0], command[..., 0] = (0.9, 2.1), (1.0, 2.0)
+    trace = SimpleNamespace(
+        qpos=np.zeros((150, 2, 23)), linvel=linvel, command=command, ground=None
+    )
+    films.write_video(out, robot.load("high"), trace, [range(100, 150)] * 2, dt=0.01)
 
 
 def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
@@ -447,8 +569,8 @@ def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
     imageio = pytest.importorskip("imageio.v2", reason="the extra 'video' is not installed")
     pytest.importorskip("imageio_ffmpeg", reason="the extra 'video' is not installed")
     said = []
-    write = play.caption
-    monkeypatch.setattr(play, "caption", lambda p, text: said.append(text) or write(p, text))
+    write = films.caption
+    monkeypatch.setattr(films, "caption", lambda p, text: said.append(text) or write(p, text))
     film_two_speeds(tmp_path / "out.mp4")
     frames = imageio.mimread(tmp_path / "out.mp4", memtest=False)
     assert len(frames) == 50 and max(f.max() for f in frames) > 200
@@ -458,7 +580,7 @@ def test_video_carries_the_speeds(blank_renderer, monkeypatch, tmp_path):
     }
 
 
-@pytest.mark.parametrize("suffix", play.ANIMATIONS)
+@pytest.mark.parametrize("suffix", films.ANIMATIONS)
 def test_animations_last_as_long_and_repeat(suffix, blank_renderer, monkeypatch, tmp_path):
     """Every fourth of 2 x 50 steps of 10 ms is a picture of 40 ms. The file may store equal
     pictures as one longer picture, so the test checks the total time. imageio_ffmpeg is not
@@ -477,7 +599,7 @@ def test_animations_last_as_long_and_repeat(suffix, blank_renderer, monkeypatch,
     ("fall", "steps"), [(150, (100, 150)), (120, (70, 120)), (30, (0, 30)), (0, (0, 1))]
 )
 def test_what_is_shown_ends_with_the_fall(fall, steps):
-    assert play.shown(np.arange(150) < fall, start=100) == range(*steps)
+    assert films.shown(np.arange(150) < fall, start=100) == range(*steps)
 
 
 def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch):

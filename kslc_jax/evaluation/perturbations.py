@@ -68,6 +68,19 @@ ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
 """Names of the changes that belong in `trials.Setting.randomize`."""
 
 
+def check_disturbances(punch: float, top: float | None) -> None:
+    """ConfigError if the force of punches [N] or the top speed of schedules [m/s] is wrong."""
+    if not (math.isfinite(punch) and punch >= 0):
+        raise ConfigError("punch must be a force in newtons, not negative")
+    if top is not None and not (math.isfinite(top) and top > 0):
+        raise ConfigError("top must be a positive speed")
+
+
+def disturbed(randomize: RandomizeConfig, punch: float, hold_arms: bool) -> RandomizeConfig:
+    """`randomize` with punches of `punch` [N], and with arms that follow random targets."""
+    return dataclasses.replace(randomize, punch=(punch, punch), held_arms=float(hold_arms))
+
+
 def terrain(text: str) -> TerrainConfig:
     """Ground of one kind and size, from a text such as 'rough:0.05'. ConfigError if it is wrong."""
     kind, _, size = text.partition(":")

@@ -9,22 +9,20 @@ import errno
 import io
 import socket
 import time
+from collections.abc import Callable
 from pathlib import Path
 
-import mujoco
 import numpy as np
 import viser
-from trimesh.exchange.gltf import export_glb
 
-from kslc_jax import ground as ground_lib
 from kslc_jax import policy as policy_lib
 from kslc_jax.checkpoint_format import CheckpointError
-from kslc_jax.config import ConfigError, Fidelity, TerrainConfig
+from kslc_jax.config import ConfigError, Fidelity, RandomizeConfig, TerrainConfig
 from kslc_jax.evaluation import trials
-from kslc_jax.ground import Ground
+from kslc_jax.evaluation.schedules import Schedule
 from kslc_jax.policy import Policy, load_policy
-from kslc_jax.robot import Robot
-from kslc_jax.viewer import panel, render, shapes
+from kslc_jax.viewer import panel, render
+from kslc_jax.viewer.figure import Figure
 from kslc_jax.viewer.following import Follower
 from kslc_jax.viewer.session import Pacer, Session, View
 
@@ -32,114 +30,11 @@ FPS = 30
 PANEL_HZ = 10
 """Redraws of plots and status text per second."""
 
-CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
-"""Start position and target of the camera, relative to the robot [m]; field of view [degrees]."""
-
 SPEED_SECONDS = 1.0
 """Window for the means of the actual speed and of the real-time factor [s]."""
 
-SHOWN_GROUP = 2
-"""Highest geom group that is drawn, as in MuJoCo's own viewer."""
-
-GROUND_COLOR = (214, 218, 224)
-"""Colour of uneven ground: red, green, blue."""
-
 SLOW = 0.95
 """Share of the chosen playback speed. At a lower speed the page says "too slow"."""
-
-
-# -------------------------------------------------------------------------------------------- robot
-
-
-class Figure:
-    """The robot and the floor in a viser scene.
-
-    With `follow` the robot stays in the picture and the world moves under it. Without `follow` the
-    world stays and the robot moves. The user's camera never moves by itself.
-    """
-
-    def __init__(self, server: viser.ViserServer, robot: Robot):
-        self.follow = True
-        self._server = server
-        self.draw(robot)
-
-    def draw(self, robot: Robot) -> None:
-        """Clears the scene and draws this robot, which must have high fidelity."""
-        self.robot, model = robot, robot.mj_model
-        self._model, self._data = model, mujoco.MjData(model)
-        server, scene = self._server, self._server.scene
-        scene.reset()
-        scene.configure_environment_map("studio", environment_intensity=0.4)
-        server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
-        server.initial_camera.fov = np.radians(FOV)
-        self._world = scene.add_frame("/world", show_axes=False)
-        self._bodies = {}
-        self._windows: list[viser.MeshHandle] = []
-        for geom in range(model.ngeom):
-            body = int(model.geom_bodyid[geom])
-            if model.geom_group[geom] > SHOWN_GROUP:
-                continue
-            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
-                self._add_floor(scene)
-                continue
-            if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_HFIELD:
-                self._add_ground(scene)
-                continue
-            name = f"/world/{model.body(body).name}"
-            if body not in self._bodies:
-                self._bodies[body] = scene.add_frame(name, show_axes=False)
-            glb = export_glb(shapes.mesh(model, geom), include_normals=True)
-            scene.add_glb(f"{name}/{geom}", glb)
-
-    @staticmethod
-    def _add_floor(scene: viser.SceneApi) -> None:
-        scene.add_grid(
-            "/world/floor",
-            infinite_grid=True,
-            cell_size=0.5,
-            cell_color=(214, 218, 224),
-            section_size=1.0,
-            section_color=(176, 182, 192),
-            fade_distance=40.0,
-            plane_color=(236, 238, 241),
-            plane_opacity=1.0,
-            shadow_opacity=0.3,
-        )
-
-    def _add_ground(self, scene: viser.SceneApi) -> None:
-        """Adds the windows of the height field; `show` makes one of them visible."""
-        self._windows = [
-            scene.add_mesh_simple(
-                f"/world/ground_{i}",
-                *shapes.ground(self._model, i),
-                color=GROUND_COLOR,
-                visible=False,
-            )
-            for i in range(self._model.nhfield)
-        ]
-
-    def _put_ground(self, ground: Ground, x: float, y: float) -> float:
-        """Shows the ground around x and y [m]; returns its mean height there [m]."""
-        pos, quat, far = ground_lib.place(ground, x, y, np)
-        for i, window in enumerate(self._windows):
-            window.visible, window.position, window.wxyz = i == int(far), pos, quat
-        return ground_lib.level(ground, x, y)
-
-    def show(self, view: View) -> None:
-        """Moves every body to its pose in the view."""
-        qpos = np.asarray(view.qpos)
-        self._data.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, self._data)
-        with self._server.atomic():
-            floor = self._put_ground(view.ground, qpos[0], qpos[1]) if view.ground else 0.0
-            if self.follow:
-                self._world.position = (-qpos[0], -qpos[1], -floor)
-            for body, frame in self._bodies.items():
-                frame.position = self._data.xpos[body]
-                frame.wxyz = self._data.xquat[body]
-
-
-# ------------------------------------------------------------------------------------------- viewer
 
 
 def policies(given: Path) -> dict[str, Path]:
@@ -184,13 +79,16 @@ class Viewer:
         seed: int = 0,
         follow: bool = False,
         terrain: TerrainConfig | None = None,
+        plan: Callable[[Policy], Schedule | None] = lambda policy: None,
+        randomize: RandomizeConfig = trials.NOMINAL,
     ):
         """Loads the policy and serves the page. The robot does not move before `run`.
 
         With `follow`, `policy` is the run folder of a training. The viewer takes each new policy of
-        this training. `terrain` is uneven ground of one kind and size.
+        this training. `terrain` is uneven ground of one kind and size. `plan` makes the schedule of
+        commands for a policy. `randomize` holds the disturbances.
         """
-        self._terrain = terrain
+        self._terrain, self._plan, self._randomize = terrain, plan, randomize
         self._fidelity: Fidelity = fidelity
         self._seed = seed
         self._follower = Follower(policy) if follow else None
@@ -198,20 +96,34 @@ class Viewer:
         self._policies = policies(policy)
         self._given = self._name = next(iter(self._policies))
         loaded = load_policy(folder)
+        plan(loaded)  # an unknown schedule fails before the page is served
         self.server = serve(host, port)
-        self.figure = Figure(self.server, render.shown_robot(loaded, terrain))
-        self.panel = panel.Panel(self.server, list(self._policies), loaded.config.command)
+        session = self._session(loaded)
+        self.panel = panel.Panel(
+            self.server,
+            list(self._policies),
+            loaded.config.command,
+            session.links,
+            session.schedule.name if session.schedule else None,
+        )
+        robot = render.shown_robot(loaded, terrain)
+        self.figure = Figure(self.server, robot, self.panel.choose)
         self._rng = np.random.default_rng(seed)
-        self._play(loaded)
+        self._play(session)
 
-    def _play(self, policy: Policy) -> None:
-        """Starts a new session with the policy, and draws its robot."""
+    def _session(self, policy: Policy) -> Session:
+        engine = trials.engine(policy, self._fidelity, self._terrain)
+        return Session(policy, engine, self._seed, self._plan(policy), self._randomize)
+
+    def _play(self, session: Session) -> None:
+        """Starts a new session, and draws its robot."""
+        policy = session.policy
         robot = render.shown_robot(policy, self._terrain)
         if self.figure.robot is not robot:
             self.figure.draw(robot)
-        engine = trials.engine(policy, self._fidelity, self._terrain)
-        self.session = Session(policy, engine, self._seed)
-        self.session.advance(np.zeros(3))  # compiles
+        self.session = session
+        self.session.advance()  # compiles
+        self.panel.offer(session.links)
         self.panel.allow(float(policy.curriculum.v_max))
         self._pacer = Pacer(self.session.dt)
         shown = round(panel.PLOT_SECONDS / self.session.dt)
@@ -232,7 +144,7 @@ class Viewer:
         self._name = name
         self.panel.status.content = f"loading {name} ..."
         try:
-            self._play(load_policy(self._policies[name]))
+            self._play(self._session(load_policy(self._policies[name])))
         except CheckpointError as error:
             for client in self.server.get_clients().values():
                 client.add_notification("Not loaded", str(error), color="red")
@@ -247,9 +159,9 @@ class Viewer:
         except CheckpointError:
             return
         if policy.config != self.session.policy.config:
-            self._play(policy)
+            self._play(self._session(policy))
             return
-        self.session.policy = policy
+        self.session.policy, self.session.schedule = policy, self._plan(policy)
         self.panel.allow(float(policy.curriculum.v_max))
 
     def frame(self, now: float) -> None:
@@ -266,8 +178,9 @@ class Viewer:
         rate = 0.0 if idle else panel.RATES[self.panel.rate.value]
         steps = self._pacer.due(now, rate)
         for _ in range(steps):
-            push = self.panel.take_push(self._rng)
-            self._recent.append(self.session.advance(self.panel.command, push))
+            if shove := self.panel.take_shove(self._rng):
+                self.session.shove(*shove)
+            self._recent.append(self.session.advance(self.panel.command))
         before, simulated, asked = self._paced[-1] if self._paced else (now, 0.0, 0.0)
         asked += rate * (now - before)
         self._paced.append((now, simulated + steps * self.session.dt, asked))
@@ -279,7 +192,9 @@ class Viewer:
             self._report()
 
     def _report(self) -> None:
-        """Updates the plots and the status text."""
+        """Updates the plots, the status text, and the sliders if the robot follows a schedule."""
+        if self.panel.command is None:
+            self.panel.show(np.asarray(self.session.view.command))
         seconds, simulated, wanted = np.subtract(self._paced[-1], self._paced[0])
         factor = simulated / max(seconds, 1e-6)
         slow = simulated < SLOW * wanted - self.session.dt  # one due step may still be missing

@@ -26,6 +26,9 @@ PLOT_SECONDS = 6.0
 PLOT_HEIGHT = 130
 """Height of a plot [pixels]."""
 
+MOST_NEWTONS = 1000.0
+"""Largest force of a shove [N]."""
+
 STEP = np.array([0.25, 0.1, 0.2])
 """Change of vx, vy [m/s] and yaw rate [rad/s] per key press."""
 
@@ -38,10 +41,15 @@ WAYS = {
     "U": ("Step left", (0, 1, 0)),
     "O": ("Step right", (0, -1, 0)),
 }
-ACTIONS = {"P": "Push", "space": "Pause", "R": "Reset", "X": "Stop"}
+ACTIONS = {"P": "Shove", "space": "Pause", "R": "Reset", "X": "Stop"}
 
-HELP = """**I K** faster, slower; **J L** turn; **U O** step sideways; **X** stop; **P** push;
+HELP = """**I K** faster, slower; **J L** turn; **U O** step sideways; **X** stop; **P** shove;
 **space** pause; **R** reset. **W A S D Q E** and the arrows move the camera."""
+
+DIRECTIONS = {"forwards": 0.0, "left": 0.5 * np.pi, "backwards": np.pi, "right": -0.5 * np.pi}
+"""Directions of a shove: angle from the robot's heading to the left [rad]."""
+
+RANDOM = "random"
 
 BLUE, ORANGE, GREEN = "#2d6cdf", "#e8590c", "#2b8a3e"
 
@@ -49,23 +57,35 @@ BLUE, ORANGE, GREEN = "#2d6cdf", "#e8590c", "#2b8a3e"
 class Panel:
     """Reads the user's input. Shows plots and text beside the picture."""
 
-    def __init__(self, server: viser.ViserServer, names: Sequence[str], config: CommandConfig):
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        names: Sequence[str],
+        config: CommandConfig,
+        links: Sequence[str],
+        schedule: str | None = None,
+    ):
         """Builds the controls.
 
         Args:
           server: the viser server of the page.
           names: names of the policies that the user can choose.
           config: gives the trained ranges of vy and of the yaw rate.
+          links: names of the links that the user can shove.
+          schedule: name of the schedule of commands; None: only the user gives commands.
         """
         self.paused = False
         self._gui, self._title = server.gui, TITLE
-        self._reset_wanted, self._push_wanted = threading.Event(), threading.Event()
+        self._reset_wanted, self._shove_wanted = threading.Event(), threading.Event()
         gui = server.gui
         turn = max(config.max_yaw_rate, STEP[2])
         gui.set_panel_label(TITLE)
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self.status = gui.add_markdown("")
+        self._schedule: viser.GuiCheckboxHandle | None = None
         with gui.add_folder("Command"):
+            if schedule is not None:
+                self._schedule = gui.add_checkbox(f"Schedule {schedule}", True)
             self._sliders = (
                 gui.add_slider("vx m/s", -MARGIN, MARGIN, 0.05, 0.0),
                 gui.add_slider(
@@ -73,8 +93,14 @@ class Panel:
                 ),
                 gui.add_slider("yaw rad/s", -turn, turn, 0.05, 0.0),
             )
-            self._push = gui.add_slider("push m/s", 0.1, 2.0, 0.1, 0.5)
-            buttons = gui.add_button_group("", ("Push", "Pause", "Reset"))
+            buttons = gui.add_button_group("", ("Stop", "Pause", "Reset"))
+        with gui.add_folder("Shove"):
+            self._link = gui.add_dropdown("link", tuple(links), initial_value=links[0])
+            self._direction = gui.add_dropdown(
+                "towards", (*DIRECTIONS, RANDOM), initial_value=RANDOM
+            )
+            self._newtons = gui.add_slider("force N", 50.0, MOST_NEWTONS, 50.0, 200.0)
+            shove = gui.add_button("Shove")
         with gui.add_folder("Show"):
             self.follow = gui.add_checkbox("Follow", True)
             self.rate = gui.add_dropdown("Playback", tuple(RATES), initial_value="1x")
@@ -83,12 +109,15 @@ class Panel:
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(HELP)
         actions: dict[str, Callable[[], None]] = {
-            "Push": self._push_wanted.set,
+            "Shove": self._shove_wanted.set,
             "Pause": self._pause,
             "Reset": self._reset_wanted.set,
             "Stop": self._stop,
         }
         buttons.on_click(lambda event: actions[event.target.value]())
+        shove.on_click(lambda _: self._shove_wanted.set())
+        for slider in self._sliders:
+            slider.on_update(self._moved)
         for key, label in ACTIONS.items():
             _bind(gui, key, label, actions[label])
         for key, (label, way) in WAYS.items():
@@ -97,11 +126,22 @@ class Panel:
     def _pause(self) -> None:
         self.paused = not self.paused
 
+    def _moved(self, event: viser.GuiEvent) -> None:
+        """Ends the schedule if a user moved the slider; `show` moves it without a client."""
+        if event.client is not None:
+            self._by_hand()
+
+    def _by_hand(self) -> None:
+        if self._schedule is not None:
+            self._schedule.value = False
+
     def _stop(self) -> None:
+        self._by_hand()
         for slider in self._sliders:
             slider.value = 0.0
 
     def _change(self, by: np.ndarray) -> None:
+        self._by_hand()
         for slider, change in zip(self._sliders, by, strict=True):
             if change:
                 wanted = round(slider.value + change, 6)
@@ -115,10 +155,29 @@ class Panel:
         speed, _ = self._plots
         speed.scales = _scales(-MARGIN, fastest + MARGIN)
 
+    def offer(self, links: Sequence[str]) -> None:
+        """Lists the links of another robot."""
+        if self._link.options != tuple(links):
+            self._link.options = tuple(links)
+
+    def choose(self, link: str) -> None:
+        """Selects a link for the next shove."""
+        self._link.value = link
+
     @property
-    def command(self) -> np.ndarray:
-        """The values of the sliders [3]: vx, vy [m/s], yaw rate [rad/s]."""
+    def command(self) -> np.ndarray | None:
+        """The values of the sliders [3]: vx, vy [m/s], yaw rate [rad/s].
+
+        None: the robot follows the schedule.
+        """
+        if self._schedule is not None and self._schedule.value:
+            return None
         return np.array([slider.value for slider in self._sliders])
+
+    def show(self, command: np.ndarray) -> None:
+        """Moves the sliders to the schedule's command [3]: vx, vy [m/s], yaw rate [rad/s]."""
+        for slider, value in zip(self._sliders, command, strict=True):
+            slider.value = round(float(np.clip(value, slider.min, slider.max)), 2)
 
     def take_reset(self) -> bool:
         """True if the user asked for a reset since the last call."""
@@ -126,13 +185,14 @@ class Panel:
         self._reset_wanted.clear()
         return wanted
 
-    def take_push(self, rng: np.random.Generator) -> np.ndarray | None:
-        """A push [2, m/s] in a random direction if the user asked for one since the last call."""
-        if not self._push_wanted.is_set():
+    def take_shove(self, rng: np.random.Generator) -> tuple[str, float, float] | None:
+        """Arguments of `Session.shove` if the user asked for a shove since the last call."""
+        if not self._shove_wanted.is_set():
             return None
-        self._push_wanted.clear()
-        angle = rng.uniform(0.0, 2.0 * np.pi)
-        return self._push.value * np.array([np.cos(angle), np.sin(angle)])
+        self._shove_wanted.clear()
+        direction = self._direction.value
+        angle = rng.uniform(0.0, 2.0 * np.pi) if direction == RANDOM else DIRECTIONS[direction]
+        return self._link.value, self._newtons.value, angle
 
     def title(self, factor: float, slow: bool) -> None:
         """Shows the real-time factor in the title if it is slow. A folded panel shows its title."""

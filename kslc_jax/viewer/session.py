@@ -1,4 +1,4 @@
-"""One environment with a policy. The command may change at any step.
+"""One environment with a policy. The command may change at any step, or follow a schedule.
 
 This module has no window and reads no clock. `Session` does control steps. `Pacer` computes how
 many control steps are due.
@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax import env, maths, physics, signals
-from kslc_jax.config import Config, PhysicsConfig
+from kslc_jax.config import Config, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.evaluation import trials
+from kslc_jax.disturbances import PUNCH_SECONDS
+from kslc_jax.evaluation import schedules, trials
+from kslc_jax.evaluation.schedules import Leg, Schedule
 from kslc_jax.ground import Ground
 from kslc_jax.networks import Params
 from kslc_jax.policy import Policy
@@ -69,37 +71,71 @@ class Memory:
     """State of a session between two control steps."""
 
     env: env.EnvState
-    heading: jax.Array  # [] rad, commanded while the commanded yaw rate is 0
+    leg: Leg  # the present command
+    key: jax.Array  # random key of the schedule, another one in each episode
+
+
+@flax.struct.dataclass
+class Asked:
+    """The user's wishes for one control step."""
+
+    command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s]
+    by_hand: jax.Array  # [] bool, False: the command of the schedule counts
+    force: jax.Array  # [nbody, 6] force [N] and torque [N m] on each body, world frame
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _reset(config: Config, curriculum: Curriculum, key: jax.Array) -> tuple[Memory, View]:
     state = env.reset(config, key, curriculum)
-    return Memory(state, jnp.zeros(())), _view(config, state, jnp.zeros(3), jnp.zeros((), bool))
+    memory = Memory(state, schedules.before_start(0.0), jax.random.fold_in(key, 1))
+    return memory, _view(config, state, jnp.zeros(3), jnp.zeros((), bool))
 
 
-@functools.partial(jax.jit, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=(0, 1))
 def _advance(
     config: Config,
+    schedule: Schedule | None,
     params: Params,
     curriculum: Curriculum,
     memory: Memory,
-    command: jax.Array,
-    push: jax.Array,
+    asked: Asked,
     key: jax.Array,
     count: jax.Array,
 ) -> tuple[Memory, View]:
     """One control step. After a fall the view shows the state before the step."""
-    qvel = memory.env.physics.qvel.at[:2].add(push)
-    pushed = memory.env.replace(physics=memory.env.physics.replace(qvel=qvel))
-    before = trials.with_command(config, pushed, command, memory.heading)
+    leg = _next_leg(config, schedule, memory, asked)
+    before = trials.with_command(config, memory.env, leg.velocity, leg.heading)
     action = Policy(config, params, curriculum, 0).act_on(before.history)
-    after, outcome = env.step(config, before, action, jax.random.fold_in(key, count), curriculum)
+    key_step = jax.random.fold_in(key, count)
+    simulate = functools.partial(_simulate, asked.force)
+    after, outcome = env.step(config, before, action, key_step, curriculum, simulate)
     fallen = outcome.terminated
-    view = _view(config, maths.tree_where(fallen, before, after), command, fallen)
+    view = _view(config, maths.tree_where(fallen, before, after), leg.velocity, fallen)
     yaw = signals.read(physics.robot_for(config.physics), after.physics).base_euler[2]
-    heading = jnp.where(command[2] == 0.0, memory.heading, yaw)
-    return Memory(after, jnp.where(fallen, 0.0, heading)), view
+    leg = leg.replace(heading=jnp.where(leg.velocity[2] == 0.0, leg.heading, yaw))
+    again = Memory(after, schedules.before_start(0.0), jax.random.fold_in(memory.key, count))
+    return maths.tree_where(fallen, again, Memory(after, leg, memory.key)), view
+
+
+def _next_leg(config: Config, schedule: Schedule | None, memory: Memory, asked: Asked) -> Leg:
+    """The leg of the coming step: the user's command, or the leg of the schedule.
+
+    When the user gives the command back, the schedule begins its next leg.
+    """
+    by_hand = memory.leg.replace(velocity=asked.command, left=jnp.zeros(()))
+    if schedule is None:
+        return by_hand
+    qpos = memory.env.physics.qpos
+    yaw = maths.quat_to_euler(qpos[3:7])[2]
+    leg, dt = memory.leg, config.control_dt
+    planned = schedules.update(schedule, config.command, leg, memory.key, yaw, qpos[:2], dt)
+    return maths.tree_where(asked.by_hand, by_hand, planned)
+
+
+def _simulate(shove, config, state, target, dynamics, ground_friction, force):
+    """`physics.step` with the force `shove` [nbody, 6] beside that of the disturbances."""
+    total = shove if force is None else force + shove
+    return physics.step(config, state, target, dynamics, ground_friction, total)
 
 
 def _view(config: Config, state: env.EnvState, command: jax.Array, fallen: jax.Array) -> View:
@@ -120,13 +156,36 @@ class Session:
 
     view: View
 
-    def __init__(self, policy: Policy, engine: PhysicsConfig, seed: int = 0):
-        self.policy = policy
+    def __init__(
+        self,
+        policy: Policy,
+        engine: PhysicsConfig,
+        seed: int = 0,
+        schedule: Schedule | None = None,
+        randomize: RandomizeConfig = trials.NOMINAL,
+    ):
+        """Starts the first episode.
+
+        Args:
+          policy: acts deterministically.
+          engine: the physics, see `trials.engine`.
+          seed: seed of initial states and of the schedule's random commands.
+          schedule: the commands of `advance(None)`.
+          randomize: differences of the robot, and disturbances such as punches.
+        """
+        self.policy, self.schedule = policy, schedule
         self.dt = engine.control_dt
-        self._config = trials.trial_config(policy.config, trials.Setting(engine), 1)
+        setting = trials.Setting(engine, randomize)
+        self._config = trials.trial_config(policy.config, setting, 1)
         self._key_reset, self._key_step = jax.random.split(jax.random.key(seed))
+        self._model = physics.robot_for(engine).mj_model
         self._steps = self._resets = 0
         self.reset()
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links that `shove` knows, the base first."""
+        return tuple(self._model.body(i).name for i in range(1, self._model.nbody))
 
     def reset(self) -> View:
         """Starts a new episode."""
@@ -136,37 +195,69 @@ class Session:
         # On a named device, like the loaded parameters. Else the second step compiles again.
         self._memory = jax.device_put(memory, jax.devices()[0])
         self._lies, self._walks = 0.0, False
+        self._end_shove()
         self.view = jax.device_get(view)
         return self.view
 
-    def advance(self, command: np.ndarray, push: np.ndarray | None = None) -> View:
-        """Does one control step. After a fall the view stays for `FALLEN_SECONDS`.
+    def _end_shove(self) -> None:
+        self._shove_steps, self._force = 0, np.zeros((self._model.nbody, 6), np.float32)
 
-        Then a new episode starts.
+    def shove(self, link: str, newtons: float, angle: float) -> None:
+        """Pushes a link with a horizontal force for the next `PUNCH_SECONDS`.
+
+        A new shove replaces the present one.
 
         Args:
-          command: [3] vx, vy [m/s], yaw rate [rad/s], base frame.
-          push: [2] sudden change of the base's velocity in the world frame [m/s].
+          link: one of `links`; the force acts at its centre of mass.
+          newtons: size of the force [N].
+          angle: direction of the force [rad], from the robot's present heading to the left.
+        """
+        w, x, y, z = self.view.qpos[3:7]
+        angle += np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        self._end_shove()
+        way = np.array([np.cos(angle), np.sin(angle)])
+        self._force[self._model.body(link).id, :2] = newtons * way
+        self._shove_steps = round(PUNCH_SECONDS / self.dt)
+
+    def advance(self, command: np.ndarray | None = None) -> View:
+        """Does one control step. After a fall the view stays for `FALLEN_SECONDS`.
+
+        Then a new episode starts, and the schedule with it.
+
+        Args:
+          command: [3] vx, vy [m/s], yaw rate [rad/s], base frame. None: the command of the
+            schedule; without a schedule the robot stands.
         """
         if self._lies > self.dt / 2:
             self._lies -= self.dt
             return self.view
-        dead_zone = self._config.command.dead_zone
-        command, self._walks = steady(np.asarray(command), self._walks, dead_zone)
+        if self._shove_steps == 0:
+            self._end_shove()
         self._memory, view = _advance(
             self._config,
+            self.schedule,
             self.policy.params,
             self.policy.curriculum,
             self._memory,
-            np.asarray(command, np.float32),
-            np.asarray((0.0, 0.0) if push is None else push, np.float32),
+            self._asked(command),
             self._key_step,
             self._steps,
         )
         self._steps += 1
+        self._shove_steps = max(0, self._shove_steps - 1)
         self.view = jax.device_get(view)
-        self._lies = FALLEN_SECONDS if self.view.fallen else 0.0
+        if self.view.fallen:
+            self._lies = FALLEN_SECONDS
+            self._end_shove()
         return self.view
+
+    def _asked(self, command: np.ndarray | None) -> Asked:
+        dead_zone, by_hand = self._config.command.dead_zone, command is not None
+        wanted = np.zeros(3) if command is None else np.asarray(command)
+        wanted, self._walks = steady(wanted, self._walks, dead_zone)
+        return Asked(
+            jnp.asarray(wanted, jnp.float32), jnp.asarray(by_hand), jnp.asarray(self._force)
+        )
 
 
 class Pacer:
