@@ -3,6 +3,9 @@
 A command module imports neither JAX nor MuJoCo at its top, so that `--help` is quick.
 """
 
+import contextlib
+import io
+import re
 import sys
 from collections.abc import Callable
 from decimal import Decimal, InvalidOperation
@@ -16,6 +19,11 @@ from kslc_jax import runtime, streams
 from kslc_jax.errors import UserError
 
 A = TypeVar("A")
+
+
+class UsageError(UserError):
+    """A command line cannot be read. The message names the option and the value."""
+
 
 Paths = Annotated[
     tyro.conf.Positional[tuple[Path, ...]],
@@ -61,10 +69,32 @@ def _integers(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[int] | None:
 def parse(name: str, kind: type[A], argv: list[str] | None, text: str | None, **more: Any) -> A:
     """Reads the command line of `python -m kslc_jax.NAME` into a `kind`.
 
-    `text` is the introduction of its `--help`.
+    `text` is the introduction of its `--help`. UsageError if the command line cannot be read.
     """
-    prog = f"python -m kslc_jax.{name}"
-    return tyro.cli(kind, args=argv, description=text, prog=prog, registry=_registry, **more)
+    prog, said = f"python -m kslc_jax.{name}", io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                kind, args=argv, description=text, prog=prog, registry=_registry, **more
+            )
+    except SystemExit as stop:
+        if "Unrecognized options" in said.getvalue():  # the box names the options that there are
+            print(said.getvalue(), end="", file=sys.stderr)
+        elif stop.code:
+            raise UsageError(_message(said.getvalue())) from None
+        raise
+
+
+def _message(box: str) -> str:
+    """The message in a box of tyro, in one line: the text between its title and its first rule."""
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", box)  # without colours
+    lines = [line.strip("│ ") for line in plain.splitlines()[1:]]
+    rules = [number for number, line in enumerate(lines) if line and not line.strip("─-")]
+    begin = 1 if rules[:1] == [0] else 0  # without UTF-8 a rule follows the title, too
+    end = next((number for number in rules if number >= begin), len(lines))
+    # For an option that may be None, tyro first says why the value is not None.
+    text = re.sub(r": no type matching .*<class '\w+'>: ", ": ", " ".join(lines[begin:end]))
+    return text.removeprefix("Error parsing ")
 
 
 # ----------------------------------------------------------------------------------------- running

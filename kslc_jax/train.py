@@ -97,7 +97,7 @@ def join(argv: list[str]) -> None:
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("coordinator", "processes", "process-index"):
-        early.add_argument(f"--{name}", f"--{name.replace('-', '_')}", dest=name)
+        early.add_argument(f"--{name}", f"--{name.replace('-', '_')}", nargs="?", dest=name)
     known, _ = early.parse_known_args(argv)
     given = tuple(vars(known).values())
     if any(given) and not {"-h", "--help"} & set(argv):
@@ -143,10 +143,11 @@ def parse(argv: list[str]) -> Args:
       ConfigError: an option is wrong, or options exclude each other.
     """
     early = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    early.add_argument("--preset")
-    early.add_argument("--robot")
+    # An option without its value is None here; `cli.parse` refuses it.
+    early.add_argument("--preset", nargs="?")
+    early.add_argument("--robot", nargs="?")
     early.add_argument("--without", nargs="*", default=[])
-    early.add_argument("--run-dir", "--run_dir", type=Path)
+    early.add_argument("--run-dir", "--run_dir", nargs="?", type=Path)
     early.add_argument("--resume", action="store_true")
     known, _ = early.parse_known_args(argv)
     helping = "-h" in argv or "--help" in argv

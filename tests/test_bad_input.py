@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 
 import kslc_jax.evaluation
 from kslc_jax import (
+    cli,
     compare,
     doctor,
     evaluate,
@@ -56,7 +57,7 @@ def refused(main, *argv: Any) -> str:
             code = stop.code
     said = err.getvalue()
     assert code == 2 and "Traceback" not in said
-    if said.startswith("error: "):  # else tyro printed it in a box
+    if said.startswith("error: "):  # else tyro printed a box: unknown options
         assert len(said.splitlines()) == 1
     return said
 
@@ -313,6 +314,35 @@ def test_at_least_one_path_is_asked_for(main, figure, capsys):
         main([*figure, "--help"])
     assert " PATH [PATH ...] " in capsys.readouterr().out
     assert "name at least one" in refused(main, *figure)
+
+
+@pytest.mark.parametrize(
+    ("main", "argv", "said"),
+    [
+        (train.main, ["--steps", "1e3.5"], "--steps: '1e3.5' is not a whole number, such as"),
+        (train.main, ["--steps", "nan"], "--steps: 'nan' is not a whole number, such as"),
+        (train.main, ["--ppo.gamma", "x"], "--ppo.gamma: could not convert string to float"),
+        (train.main, ["--run-dir"], "Missing value for argument '--run-dir'"),
+        (train.main, ["--physics.engine", "x"], "invalid choice 'x' for argument '--physics.en"),
+        (play.main, ["d", "--port", "x"], "--port: 'x' is not a whole number, such as"),
+        (play.main, [], "Missing from python -m kslc_jax.play: PATH"),
+    ],
+)
+def test_a_value_that_cannot_be_read_is_one_line(main, argv, said):
+    assert refused(main, *argv).startswith(f"error: {said}")
+
+
+def test_a_box_without_utf8_and_with_colours_is_one_line_too():
+    rule = f" {'-' * 40} "
+    box = [
+        " Value error ",
+        rule,
+        "  \x1b[1mError parsing --n:\x1b[0m no",
+        "  number  ",
+        rule,
+        "  help",
+    ]
+    assert cli._message("\n".join(box)) == "--n: no number"
 
 
 def test_what_a_link_points_to_is_written(tmp_path):
