@@ -203,7 +203,7 @@ def forget_where(folder: Path) -> None:
     Orbax only checks that they exist. People pass policies on, and the path is private.
     """
     for note in folder.rglob("commit_success.txt"):
-        if note.read_text() != COMMITTED:
+        if note.read_bytes() != COMMITTED.encode():
             note.write_text(COMMITTED)
 
 

@@ -65,7 +65,7 @@ def seed_folder(run_dir: Path, seed: int) -> Path:
 
 def seeds_in(run_dir: Path) -> list[int]:
     """The seeds that have a run folder in `run_dir`, in ascending order; none in a run folder."""
-    if (run_dir / CONFIG).exists():
+    if not os.path.isdir(run_dir) or (run_dir / CONFIG).exists():
         return []
     names = [path.parent.name.removeprefix(SEED) for path in run_dir.glob(f"{SEED}*/{CONFIG}")]
     return sorted(int(name) for name in names if name.isdecimal())

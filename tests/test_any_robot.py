@@ -39,7 +39,7 @@ from kslc_jax.evaluation import gait_metrics, trials
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robots import copying, description
 from kslc_jax.robots.description import RobotError
-from kslc_jax.training import loop, run_folder
+from kslc_jax.training import run_folder, starting
 from kslc_jax.training.checkpoint_process import LocalStorage
 
 BIPED = str(Path(__file__).parent / "data" / "biped.toml")
@@ -391,7 +391,7 @@ def test_starting_from_another_robots_policy_names_the_numbers(mine, untrained, 
     policy.save_policy(known, tmp_path / "policy")
     with pytest.warns(UserWarning, match="trained with another robot: kp of .* 60 -> 66"):
         init, _ = train_step.make(setup)
-        loop._starting_from(tmp_path / "policy", setup, init, LocalStorage(), None)
+        starting.from_policy(tmp_path / "policy", setup, init, LocalStorage(), None)
 
 
 def test_a_robot_is_chosen_by_its_own_option(capsys):

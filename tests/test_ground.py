@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +30,7 @@ from kslc_jax.evaluation import perturbations, trained, trials
 SIZES = {"rough": 0.05, "slope": 10.0, "stairs": 0.1}
 KINDS = tuple(SIZES)
 ALL = TerrainConfig(**SIZES)
+BIPED = str(Path(__file__).parent / "data" / "biped.toml")
 FAR = (40.2, -21.3)
 """A place [m] beyond the first window of the height field."""
 
@@ -207,7 +209,7 @@ class TestBothModels:
         assert robot.load().mj_model.ngeom + 8 == robot.load(terrain=ALL).mj_model.ngeom
         assert robot.load().mj_model.nhfield == 0
 
-    def test_any_robot_gets_it(self, name="unitree_g1"):
+    def test_any_robot_gets_it(self, name=BIPED):
         for fidelity, terrain in (("train", ALL), ("high", only("rough"))):
             bot = robot.load(fidelity, name=name, terrain=terrain)
             assert len(bot.ground_geom_ids) == (8 if fidelity == "train" else 1)
@@ -298,10 +300,10 @@ class TestConfig:
 
     def test_another_robot_gets_smaller_steps(self):
         config = dataclasses.replace(
-            config_lib.preset("debug"), physics=PhysicsConfig(robot="unitree_g1", terrain=ALL)
+            config_lib.preset("debug"), physics=PhysicsConfig(robot=BIPED, terrain=ALL)
         )
-        share = robot.load(name="unitree_g1").length_ratio
-        scaled = similar.scaled(config, robot.load(name="unitree_g1"))
+        biped = robot.load(name=BIPED)
+        share, scaled = biped.length_ratio, similar.scaled(config, biped)
         assert scaled.physics.terrain.stairs == pytest.approx(0.1 * share, rel=0.01)
 
 
