@@ -407,6 +407,7 @@ def test_a_program_that_enables_x64_can_step(engine, monkeypatch):
     over. Traced only: that is where a wrong dtype shows, and compiling takes long."""
     config = PhysicsConfig(engine=engine)
     monkeypatch.setattr(physics, "_mjx_model", physics._mjx_model.__wrapped__)  # caches nothing
+    jax.clear_caches()  # JAX would reuse traces of other tests, which are without x64
     jax.config.update("jax_enable_x64", True)
     try:
         state = standing(config)
