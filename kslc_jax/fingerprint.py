@@ -15,6 +15,7 @@ import numpy as np
 from kslc_jax import robot as robot_lib
 from kslc_jax.config import Fidelity
 from kslc_jax.robot import Robot
+from kslc_jax.robots.shapes import mesh_data
 
 Fingerprint = dict[str, Any]
 """`values`: name -> joint or body -> number; `digests`: fidelity -> group -> checksum."""
@@ -160,9 +161,7 @@ def _vertices(model: mujoco.MjModel, geom: int) -> np.ndarray:
     """[k, 3] vertices of a geom's mesh; empty for other shapes."""
     if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
         return np.zeros((0, 3))
-    mesh = model.geom_dataid[geom]
-    start = model.mesh_vertadr[mesh]
-    return model.mesh_vert[start : start + model.mesh_vertnum[mesh]]
+    return mesh_data(model, int(model.geom_dataid[geom]))[0]
 
 
 def _digest(arrays: list[np.ndarray]) -> str:

@@ -47,7 +47,7 @@ class Robot:
     subtree: np.ndarray  # [B, B] 1 if body `column` is in the subtree of body `row`
     foot_geom_ids: np.ndarray  # sole spheres; at high fidelity also the foot boxes
     sole_geom_ids: np.ndarray  # [k] sole spheres
-    sole_inward: np.ndarray  # [k, 3] way of a contact point to its sole's middle, see _inward
+    sole_inward: np.ndarray  # [k, 3] direction from each sphere to its sole's middle, see _inward
     terrain: TerrainConfig | None  # uneven ground; None: the flat floor
     ground_geom_ids: np.ndarray  # what moves with uneven ground: a plane per sphere, or the floor
     torso_box_center: np.ndarray  # [3] m, base frame

@@ -150,7 +150,8 @@ def test_step_is_physics_step(world):
         fields = randomize.model_fields(world.robot, dynamics, 1.0)
         one = drake._host_step(CONFIG, start, np.zeros(16), dynamics, fields)
         for a, b in zip(jax.tree.leaves(both), jax.tree.leaves(one), strict=True):
-            np.testing.assert_allclose(a[i], b, rtol=0, atol=1e-12)
+            # The jitted program rounds the model's fields in another way than the eager one.
+            np.testing.assert_allclose(a[i], b, rtol=0, atol=1e-16)
 
 
 def test_a_diverged_step_shows_as_nan(world):

@@ -73,8 +73,9 @@ class TerrainConfig:
     """Sizes grow with the curriculum's v_max, and have their full range from this v_max [m/s] on.
     0: from the start."""
     critic_sees: bool = True
-    """True: the critic's frame has the ground below the feet and its slope. The actor's never has.
-    False: both networks have the shapes of a training on the flat floor (--start-from)."""
+    """True: the critic's frame has the ground below the feet and its slope. The actor's frame never
+    has them. False: both networks have the shapes of a training on the flat floor
+    (--start-from)."""
 
     def __post_init__(self):
         require(0 <= self.rough <= 0.5, "physics.terrain.rough must lie in [0, 0.5] m")

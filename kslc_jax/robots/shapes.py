@@ -91,11 +91,18 @@ def _cylinder(count: int = 48) -> np.ndarray:
     return np.concatenate(side + caps)
 
 
+def mesh_data(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3, m] and faces [F, 3] of a mesh of the model."""
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
+
+
 def _mesh_points(model: mujoco.MjModel, mesh: int, count: int = 2000) -> np.ndarray:
     """A mesh's vertices, and points that are spread over its area."""
-    vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
-    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].astype(float)
-    a, b, c = vertices[model.mesh_face[face : face + model.mesh_facenum[mesh]]].transpose(1, 0, 2)
+    vertices, faces = mesh_data(model, mesh)
+    vertices = vertices.astype(float)
+    a, b, c = vertices[faces].transpose(1, 0, 2)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     random = np.random.default_rng(0)
     chosen = random.choice(len(area), count, p=area / area.sum())
@@ -153,11 +160,11 @@ def _mesh(spec: mujoco.MjSpec, model: mujoco.MjModel, mesh: int) -> str:
     """Name of the copy of a mesh; it is made at its first use."""
     name = f"mesh{mesh}"
     if spec.mesh(name) is None:
-        vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+        vertices, faces = mesh_data(model, mesh)
         spec.add_mesh(
             name=name,
-            uservert=model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]].flatten(),
-            userface=model.mesh_face[face : face + model.mesh_facenum[mesh]].flatten(),
+            uservert=vertices.flatten(),
+            userface=faces.flatten(),
             inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,  # also for open surfaces
         )
     return name

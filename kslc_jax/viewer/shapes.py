@@ -6,6 +6,8 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
+from kslc_jax.robots.shapes import mesh_data
+
 GAMMA = 2.2
 """Exponent that turns MuJoCo's colours into the linear colours of glTF."""
 
@@ -41,13 +43,6 @@ def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     paint = PBRMaterial(baseColorFactor=rgba, metallicFactor=0.0, roughnessFactor=0.7)
     shape.visual = TextureVisuals(material=paint)
     return shape
-
-
-def mesh_data(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3, m] and faces [F, 3] of a mesh of the model."""
-    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-    face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-    return model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
 
 
 def ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
