@@ -52,10 +52,7 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
         env = state.env
         actor = rollout.windows(env.history, traj.frame, traj.age)(rows)
         critic = rollout.windows(env.privileged_history, traj.privileged, traj.age)(rows)
-
-        def apply(params, _):
-            return networks.policy(config, params, actor), networks.value(config, params, critic)
-
+        apply = train_step.policy_at(config, lambda _: (actor, critic), traj.velocity)
         return run_update(state, samples, apply)
 
     def run_update(state, samples, apply):

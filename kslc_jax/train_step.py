@@ -170,13 +170,26 @@ def _observer(
     """
     actor = windows(start.history, traj.frame, traj.age)
     critic = windows(start.privileged_history, traj.privileged, traj.age)
+    return policy_at(config, lambda i: (actor(i), critic(i)), traj.velocity, shard_index)
+
+
+def policy_at(
+    config: Config,
+    histories: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    velocity: jax.Array | None,
+    shard_index: ShardIndex = lambda index: index,
+) -> ppo.PolicyAtIndex:
+    """Function that evaluates the networks at the `histories` (actor's, critic's) of an index [B].
+
+    `velocity` [T, N, 3] are the rollout's estimates, None without an estimator.
+    """
     table = observations.critic_table(physics.robot_for(config.physics))
     at = observations.slices(table)["base_linvel"]
-    read = None if traj.velocity is None else traj.velocity.reshape(-1, networks.ESTIMATED)
+    read = None if velocity is None else velocity.reshape(-1, networks.ESTIMATED)
 
     def apply(params: Params, index: jax.Array) -> tuple[Gaussian, jax.Array, jax.Array]:
         index = shard_index(index)
-        history, seen = actor(index), critic(index)
+        history, seen = histories(index)
         dist = networks.policy(config, params, history, None if read is None else read[index])
         estimate, error = networks.estimate(config, params, history), jnp.zeros(index.shape)
         if estimate is not None:
