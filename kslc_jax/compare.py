@@ -25,7 +25,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kslc_jax import cli, evaluate, files, plots, train
+from kslc_jax import cli, evaluate, files, records, train
 from kslc_jax import config as config_lib
 from kslc_jax.config import XBOT_L, Config, ConfigError, Fidelity
 from kslc_jax.training import stopping
@@ -154,7 +154,7 @@ def run(job: Job, steps: int) -> bool:
 def trained(run: Path) -> int:
     """Environment steps of a run folder, by its metrics; 0 if it has none."""
     try:
-        return int(plots.read_metrics(run)["env_steps"][-1])
+        return int(records.read_metrics(run)["env_steps"][-1])
     except ValueError:
         return 0
 
@@ -214,12 +214,12 @@ def keep(run: Path, folder: Path) -> None:
         files.write_atomically(folder / name, (run / name).read_text())
     learnt = json.loads((run / files.LEARNING).read_text())
     for point in learnt["points"]:
-        point["rows"] = [{n: _short(row[n]) for n in plots.LEARNT} for row in point["rows"]]
+        point["rows"] = [{n: _short(row[n]) for n in records.LEARNT} for row in point["rows"]]
     files.write_atomically(folder / files.LEARNING, json.dumps(learnt))
-    records = plots.read_metrics(run)
-    count = len(records["env_steps"])
-    kept = sorted({*range(0, count, 10), *plots.growth(records), count - 1})
-    rows = ({name: _short(records[name][i]) for name in plots.COLUMNS} for i in kept)
+    metrics = records.read_metrics(run)
+    count = len(metrics["env_steps"])
+    kept = sorted({*range(0, count, 10), *records.growth(metrics), count - 1})
+    rows = ({name: _short(metrics[name][i]) for name in records.COLUMNS} for i in kept)
     files.write_atomically(folder / files.METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
 
 
@@ -253,11 +253,11 @@ def _speeds(run: Path) -> dict[float, str]:
 
 
 def _reached(run: Path) -> tuple[str, str, str]:
-    records = plots.read_metrics(run)
-    length, after = f"{records['env_steps'][-1] / 1e6:.1f} M", "start"
-    for _, steps, seconds in plots.milestones(records):
-        after = f"{steps / 1e6:.1f} M, {plots.in_minutes(seconds)}"
-    return length, f"{records['curriculum/v_max'][-1]:.1f}", after
+    metrics = records.read_metrics(run)
+    length, after = f"{metrics['env_steps'][-1] / 1e6:.1f} M", "start"
+    for _, steps, seconds in records.milestones(metrics):
+        after = f"{steps / 1e6:.1f} M, {records.in_minutes(seconds)}"
+    return length, f"{metrics['curriculum/v_max'][-1]:.1f}", after
 
 
 def report(args: Args, refused: Sequence[str]) -> None:

@@ -2,8 +2,8 @@
 
 Runs trials of the deterministic policy over commanded forward speeds and seeds. The physics is that
 of the policy's training. With --fidelity high it is full C MuJoCo: 1 ms, elliptic cones, converged
-solver, self-collision, joint friction. Prints a table with 95 % confidence intervals; --json writes
-the numbers to a file.
+solver, self-collision, joint friction. With --ground the floor is uneven. Prints a table with 95 %
+confidence intervals; --json writes the numbers to a file.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
@@ -20,6 +20,7 @@ from rich.progress import Progress
 
 from kslc_jax import cli, files
 from kslc_jax.config import ConfigError, Fidelity, require_seed
+from kslc_jax.evaluation import perturbations
 from kslc_jax.evaluation.tables import Row, console, table
 
 if TYPE_CHECKING:
@@ -30,6 +31,9 @@ SHORTEST = 3.0
 
 LONGEST = 86_400.0
 """Longest trial [s]: a day."""
+
+CONDITIONS = ("fidelity", "ground", "seeds", "seconds", "noise", "seed")
+"""Options that the JSON file records."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,9 @@ class Args:
     """Length of a trial [s]."""
     fidelity: Fidelity = "train"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
+    ground: str | None = None
+    """Uneven ground: rough:M (random waves of up to M metres up and down), slope:DEGREES, or
+    stairs:M (steps of M metres). None: the flat floor. kslc_jax.sim2sim compares several."""
     noise: bool = False
     """Sensor noise, action delay and action noise at the full level of training."""
     seed: int = 0
@@ -56,6 +63,8 @@ class Args:
     def __post_init__(self):
         check(self.speeds, self.seeds, self.seconds)
         require_seed(self.seed)
+        if self.ground is not None:
+            perturbations.terrain(self.ground)
 
 
 def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
@@ -75,7 +84,8 @@ def sweep(
     from kslc_jax.evaluation import trials
     from kslc_jax.evaluation.measure import measure
 
-    engine = trials.engine(policy, args.fidelity)
+    terrain = None if args.ground is None else perturbations.terrain(args.ground)
+    engine = trials.engine(policy, args.fidelity, terrain)
     setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
     return measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
 
@@ -96,10 +106,11 @@ def _report(args: Args) -> None:
         task = bar.add_task("trying", total=1.0)
         rows = sweep(args, policy, lambda share: bar.update(task, completed=share))
     title = f"{args.policy}, train step {policy.step}, {args.fidelity} fidelity"
+    title += f", {args.ground}" if args.ground else ""
     screen.print(table(rows, title))
     if args.json is not None:
         what = {"policy": policy_name(args.policy), "step": policy.step}
-        how = {n: getattr(args, n) for n in ("fidelity", "seeds", "seconds", "noise", "seed")}
+        how = {name: getattr(args, name) for name in CONDITIONS}
         files.write_json(args.json, {**what, **how, "rows": rows})
 
 

@@ -1,5 +1,5 @@
 """Draw figures from stored data:
-python -m kslc_jax.plots {training,learning,performance,momentum,schedules} ...
+python -m kslc_jax.plots {training,learning,performance,momentum,schedules,conditions} ...
 
 Examples:
   python -m kslc_jax.plots training runs/laptop-seed0 --out curve.png
@@ -7,11 +7,10 @@ Examples:
   python -m kslc_jax.plots performance runs/compare/*/evaluation.json --out performance.png
   python -m kslc_jax.plots momentum runs/compare/*/evaluation.json --out momentum.png
   python -m kslc_jax.plots schedules sim2sim.json --out schedules.png
+  python -m kslc_jax.plots conditions sim2sim.json --out conditions.png
 """
 
-import json
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,11 +23,10 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from kslc_jax import cli, files
+from kslc_jax import cli, records
 from kslc_jax.cli import Paths
 from kslc_jax.errors import UserError
-
-Records = dict[str, np.ndarray]
+from kslc_jax.records import Curve, Records
 
 PANELS: tuple[tuple[str, str, str], ...] = (
     ("curriculum/v_max", "largest commanded speed [m/s]", "C0"),
@@ -37,12 +35,6 @@ PANELS: tuple[tuple[str, str, str], ...] = (
     ("steps_per_second", "throughput [control steps/s]", "C3"),
 )
 
-
-COLUMNS = ("env_steps", "seconds", *(name for name, _, _ in PANELS))
-"""Values that each record of a metrics.jsonl must have."""
-
-LEARNT = ("command", "survival", "forward_mean")
-"""Values that each row of a learning.json must have."""
 
 PERFORMANCE: tuple[tuple[str, str], ...] = (
     ("forward_mean", "mean forward speed [m/s]"),
@@ -59,44 +51,13 @@ MOMENTUM: tuple[tuple[str, str], ...] = (
 )
 
 
-def read_metrics(path: Path) -> Records:
-    """Columns of a metrics.jsonl, or of the one in a run folder; ValueError if not readable."""
-    path = path / files.METRICS if path.is_dir() else path
-    if not path.is_file():
-        raise ValueError(f"no {files.METRICS} at {path}")
-    try:
-        rows = [json.loads(line) for line in path.read_text().splitlines()]
-        records = {name: np.array([row[name] for row in rows], float) for name in rows[0]}
-        _ = [records[name] for name in COLUMNS]
-    except (ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
-        raise ValueError(f"{path} holds no metrics of a training") from error
-    return records
-
-
-def growth(records: Records) -> np.ndarray:
-    """Indices of the records at which the commanded-speed range has grown."""
-    return np.flatnonzero(np.diff(records["curriculum/v_max"]) > 0) + 1
-
-
-def milestones(records: Records) -> list[tuple[float, float, float]]:
-    """(v_max [m/s], environment steps, seconds) at each change of the commanded-speed range."""
-    v = records["curriculum/v_max"]
-    return [(v[i], records["env_steps"][i], records["seconds"][i]) for i in growth(records)]
-
-
-def in_minutes(seconds: float) -> str:
-    """A time [s] as '34 min'; below ten minutes with a decimal, as '1.5 min'."""
-    minutes = seconds / 60.0
-    return f"{minutes:.0f} min" if minutes >= 10.0 else f"{minutes:.1f} min"
-
-
 def learning_curve(runs: dict[str, Records], out: Path) -> None:
     """Draws one panel per quantity and one line per run, with the wall times of the first run."""
     figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True, layout="constrained")
     for axis, (name, label, color) in zip(axes, PANELS, strict=True):
-        for i, (run, records) in enumerate(runs.items()):
+        for i, (run, columns) in enumerate(runs.items()):
             line = color if len(runs) == 1 else f"C{i}"
-            axis.plot(records["env_steps"] / 1e6, records[name], color=line, label=run)
+            axis.plot(columns["env_steps"] / 1e6, columns[name], color=line, label=run)
         axis.set_ylabel(label, fontsize=8)
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3)
@@ -105,90 +66,15 @@ def learning_curve(runs: dict[str, Records], out: Path) -> None:
     if len(runs) > 1:
         axes[0].legend(fontsize=8)
     first = next(iter(runs.values()))
-    for v, steps, seconds in milestones(first):
+    for v, steps, seconds in records.milestones(first):
         axes[0].annotate(
-            f"{v:.1f} m/s\n{in_minutes(seconds)}",
+            f"{v:.1f} m/s\n{records.in_minutes(seconds)}",
             (steps / 1e6, v),
             textcoords="offset points",
             xytext=(4, -16),
             fontsize=7,
         )
     _save(figure, out)
-
-
-def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, float]]]]:
-    """Rows of evaluation files, one list per seed, by method.
-
-    The method is the name of the file without '-seedN'. For files with the name evaluation.json it
-    is the name of their folder.
-
-    Raises:
-      ValueError: a file is no evaluation, or the seeds of a method were tried at different speeds.
-    """
-    found: dict[str, list[list[dict[str, float]]]] = {}
-    for path in paths:
-        try:
-            content = json.loads(path.read_text())
-            rows = content["rows"] if "rows" in content else content["conditions"]["nominal"]
-            _ = [float(row["command"]) for row in rows]
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ValueError(f"{path} is no evaluation (of evaluate or sim2sim --json)") from error
-        name = path.resolve().parent.name if path.name == files.EVALUATION else path.stem
-        found.setdefault(_method(name), []).append(rows)
-    for name, seeds in found.items():
-        if len({tuple(row["command"] for row in rows) for rows in seeds}) > 1:
-            raise ValueError(f"the seeds of {name} were tried at different speeds")
-    return found
-
-
-def _method(run: str) -> str:
-    return run.rsplit("-seed", 1)[0]
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Mean speeds of one training's policies, over its environment steps."""
-
-    env_steps: np.ndarray  # [P]
-    speeds: tuple[float, ...]  # [V] m/s, commanded
-    reached: np.ndarray  # [P, V] m/s, mean forward speed
-
-
-def read_learning(paths: Sequence[Path]) -> dict[str, list[Curve]]:
-    """Curves of learning.json files, or of those in run folders, by method.
-
-    The seeds of a method are cut to the length of the shortest one.
-
-    Raises:
-      ValueError: a file is no learning curve, or the curves do not fit together.
-    """
-    found: dict[str, list[Curve]] = {}
-    for path in paths:
-        file = path / files.LEARNING if path.is_dir() else path
-        try:
-            content = json.loads(file.read_text())
-            found.setdefault(_method(content["run"]), []).append(_curve(content["points"]))
-        except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-            raise ValueError(f"{file} is no learning curve (made by kslc_jax.learning)") from error
-    if len({curve.speeds for curves in found.values() for curve in curves}) > 1:
-        raise ValueError("the runs were tried at different speeds")
-    return {name: _aligned(name, curves) for name, curves in found.items()}
-
-
-def _curve(points: list[dict]) -> Curve:
-    return Curve(
-        np.array([point["env_steps"] for point in points]),
-        tuple(row["command"] for row in points[0]["rows"]),
-        np.array([[row["forward_mean"] for row in point["rows"]] for point in points]),
-    )
-
-
-def _aligned(name: str, curves: list[Curve]) -> list[Curve]:
-    count = min(len(curve.env_steps) for curve in curves)
-    cut = [Curve(c.env_steps[:count], c.speeds, c.reached[:count]) for c in curves]
-    if not all(np.array_equal(c.env_steps, cut[0].env_steps) for c in cut):
-        raise ValueError(f"the seeds of {name} kept their policies at different steps")
-    return cut
 
 
 def learning(methods: dict[str, list[Curve]], out: Path) -> None:
@@ -283,16 +169,6 @@ def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
     _save(figure, out)
 
 
-def read_schedules(path: Path) -> list[dict]:
-    """Nominal rows of a file of sim2sim --schedule --json; ValueError if it is no such file."""
-    try:
-        rows = json.loads(path.read_text())["conditions"]["nominal"]
-        _ = [row["series"]["forward"][0][0] for row in rows]
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"{path} holds no schedules (of sim2sim --schedule --json)") from error
-    return rows
-
-
 def schedules(rows: list[dict], out: Path) -> None:
     """Draws commanded and actual speed over time: a column per schedule, a row per robot."""
     robots = max(len(row["series"]["forward"]) for row in rows)
@@ -319,6 +195,32 @@ def schedules(rows: list[dict], out: Path) -> None:
     figure.supxlabel("time [s]", fontsize=10)
     figure.supylabel("forward speed [m/s]", fontsize=10)
     _legend(figure, axes[0, 0])
+    _save(figure, out)
+
+
+def conditions(results: dict[str, list[dict]], out: Path) -> None:
+    """Draws a table: a row per condition, a column per commanded speed or schedule.
+
+    The colour of a field is the share of the robots that did not fall. The text adds their mean
+    forward speed [m/s], under constant commands.
+    """
+    columns = [records.row_name(row) for row in next(iter(results.values()))]
+    survival = np.array([[row["survival"] for row in rows] for rows in results.values()])
+    size = (2.5 + 1.1 * len(columns), 1.2 + 0.45 * len(results))
+    figure, axis = plt.subplots(figsize=size, layout="constrained")
+    image = axis.imshow(survival, vmin=0.0, vmax=1.0, cmap="viridis", aspect="auto")
+    for i, rows in enumerate(results.values()):
+        for j, row in enumerate(rows):
+            text = f"{row['survival']:.0%}" + "*" * ("beyond" in row)
+            if "schedule" not in row and "forward_mean" in row:
+                text += f"\n{row['forward_mean']:.2f}"
+            color = "black" if row["survival"] > 0.5 else "white"
+            axis.text(j, i, text, ha="center", va="center", fontsize=8, color=color)
+    axis.set_xticks(range(len(columns)), columns)
+    axis.set_yticks(range(len(results)), list(results))
+    axis.tick_params(length=0)
+    figure.colorbar(image, label="share that did not fall", format="{x:.0%}")
+    figure.supxlabel("commanded; below the share: mean speed [m/s]; *: beyond training", fontsize=8)
     _save(figure, out)
 
 
@@ -384,33 +286,49 @@ class Schedules:
     """File of the figure."""
 
 
-def draw(args: Training | Learning | Performance | Momentum | Schedules) -> None:
+@dataclass(frozen=True)
+class Conditions:
+    """Survival and mean speed under each condition: perturbations, grounds, starting headings."""
+
+    results: tyro.conf.Positional[Path]
+    """JSON file of sim2sim."""
+    out: Path = Path("conditions.png")
+    """File of the figure."""
+
+
+Figure = Training | Learning | Performance | Momentum | Schedules | Conditions
+
+
+def draw(args: Figure) -> None:
     """Draws the figure of `args`; ValueError if its data are missing or unreadable."""
     if isinstance(args, Schedules):
-        return schedules(read_schedules(args.results), args.out)
+        return schedules(records.read_schedules(args.results), args.out)
+    if isinstance(args, Conditions):
+        return conditions(records.read_conditions(args.results), args.out)
     if not (args.runs if isinstance(args, Training | Learning) else args.evaluations):
         raise ValueError("name at least one file or run folder")
     match args:
         case Training():
             _training(args)
         case Learning():
-            learning(read_learning(args.runs), args.out)
+            learning(records.read_learning(args.runs), args.out)
         case Performance():
-            performance(read_evaluations(args.evaluations), args.out)
+            performance(records.read_evaluations(args.evaluations), args.out)
         case Momentum():
-            momentum(read_evaluations(args.evaluations), args.out)
+            momentum(records.read_evaluations(args.evaluations), args.out)
 
 
 def _training(args: Training) -> None:
-    runs = {str(path): read_metrics(path) for path in args.runs}
-    for run, records in runs.items():
+    runs = {str(path): records.read_metrics(path) for path in args.runs}
+    for run, columns in runs.items():
         print(run)
-        for v, steps, seconds in milestones(records):
-            print(f"  v_max {v:.1f} m/s at {steps / 1e6:5.1f} M steps, {in_minutes(seconds):>7}")
+        for v, steps, seconds in records.milestones(columns):
+            after = f"{steps / 1e6:5.1f} M steps, {records.in_minutes(seconds):>7}"
+            print(f"  v_max {v:.1f} m/s at {after}")
     learning_curve(runs, args.out)
 
 
-def _run(args: Training | Learning | Performance | Momentum | Schedules) -> None:
+def _run(args: Figure) -> None:
     try:
         draw(args)
     except ValueError as error:
@@ -420,7 +338,7 @@ def _run(args: Training | Learning | Performance | Momentum | Schedules) -> None
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    kinds: Any = Training | Learning | Performance | Momentum | Schedules
+    kinds: Any = Figure
     return cli.run(lambda: _run(cli.parse("plots", kinds, argv, __doc__)))
 
 

@@ -104,7 +104,7 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     Returns the environment steps at which the commands reached each speed [m/s]. Raises the errors
     of `loop.train`, and Stopped.
     """
-    from kslc_jax import plots
+    from kslc_jax import records
     from kslc_jax.checkpoint_format import has_checkpoints
     from kslc_jax.training import loop
     from kslc_jax.training.logs import Progress
@@ -115,8 +115,8 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     state = loop.train(config, args.run_dir, going_on, Progress(config))
     if int(state.step) < config.num_updates:
         raise Stopped("stopped; the same command tries the policy again and goes on training")
-    records = plots.read_metrics(args.run_dir)
-    return {f"{speed:g}": steps for speed, steps, _ in plots.milestones(records)}
+    metrics = records.read_metrics(args.run_dir)
+    return {f"{speed:g}": steps for speed, steps, _ in records.milestones(metrics)}
 
 
 def report(rows: list[Row], title: str) -> Table:

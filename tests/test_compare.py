@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from kslc_jax import compare, config, files, plots
+from kslc_jax import compare, config, files, records
 
 
 def test_every_variant_and_seed_is_a_job(tmp_path):
@@ -56,13 +56,13 @@ def finished_run(folder, survival=1.0):
     )
     point = {"env_steps": 2500000, "rows": [row | {"forward_mean": 2 / 3, "forward_std": 0.1}]}
     (folder / files.LEARNING).write_text(json.dumps({"run": folder.name, "points": [point]}))
-    records = [
-        dict.fromkeys(plots.COLUMNS, 1 / 3)
+    lines = [
+        dict.fromkeys(records.COLUMNS, 1 / 3)
         | {"env_steps": 1e5 * i, "seconds": 10.0 * i, "curriculum/v_max": 0.5 + (i >= 14)}
         | {"not in any figure": 1.0}
         for i in range(1, 26)
     ]
-    (folder / "metrics.jsonl").write_text("".join(f"{json.dumps(r)}\n" for r in records))
+    (folder / "metrics.jsonl").write_text("".join(f"{json.dumps(r)}\n" for r in lines))
 
 
 ASKED = ("--steps", "2500000", "--speeds", "1.0", "--variants", "kslc")
@@ -169,12 +169,12 @@ def test_what_is_kept_draws_the_same_figures(tmp_path):
     finished_run(run)
     argv = ["--out", str(run.parent), "--keep", str(kept), *ASKED, "--seeds", "0"]
     assert compare.main(argv) == 0
-    records, short = plots.read_metrics(run), plots.read_metrics(kept / run.name)
-    assert list(short) == list(plots.COLUMNS)
+    metrics, short = records.read_metrics(run), records.read_metrics(kept / run.name)
+    assert list(short) == list(records.COLUMNS)
     assert list(short["env_steps"] / 1e5) == [1, 11, 14, 21, 25]
-    assert plots.milestones(short) == plots.milestones(records)
+    assert records.milestones(short) == records.milestones(metrics)
     assert list(short["episode_steps"]) == [0.33333] * 5
-    (curve,) = plots.read_learning([kept / run.name])["kslc"]
+    (curve,) = records.read_learning([kept / run.name])["kslc"]
     assert curve.reached == [[0.66667]] and curve.env_steps == [2500000]
     for name in ("config.json", "versions.json", files.EVALUATION):
         assert (kept / run.name / name).read_text() == (run / name).read_text()

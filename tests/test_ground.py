@@ -14,6 +14,7 @@ from kslc_jax import config as config_lib
 from kslc_jax import (
     curriculum,
     env,
+    evaluate,
     load_policy,
     observations,
     physics,
@@ -25,7 +26,7 @@ from kslc_jax import (
 )
 from kslc_jax import ground as ground_lib
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, TerrainConfig
-from kslc_jax.evaluation import perturbations, trained, trials
+from kslc_jax.evaluation import measure, perturbations, trained, trials
 
 SIZES = {"rough": 0.05, "slope": 10.0, "stairs": 0.1}
 KINDS = tuple(SIZES)
@@ -322,6 +323,21 @@ class TestJudging:
         assert [t.uneven for t in terrains] == [None, only("rough"), only("slope"), None]
         with pytest.raises(ConfigError, match="need --engine mujoco"):
             sim2sim.Args("x", engine="drake", ground=("slope:10",))
+
+    @pytest.mark.parametrize("fidelity", ["train", "high"])
+    def test_evaluate_tries_the_policy_on_it(self, fidelity, monkeypatch):
+        """`evaluate --ground` gives the trials this ground at both fidelities."""
+        settings = []
+        monkeypatch.setattr(
+            measure, "measure", lambda policy, setting, *_: settings.append(setting)
+        )
+        for name in (None, "slope:10"):
+            args = evaluate.Args("x", ground=name, fidelity=fidelity)
+            evaluate.sweep(args, load_policy("xbot_l_run"))
+        assert [s.physics.uneven for s in settings] == [None, only("slope")]
+        assert all(s.physics.fidelity == fidelity for s in settings)
+        with pytest.raises(ConfigError, match="ground: "):
+            evaluate.Args("x", ground="bumps:1")
 
     def test_ground_beyond_the_training_is_marked(self):
         policy = load_policy("xbot_l_run")

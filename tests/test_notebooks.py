@@ -9,7 +9,7 @@ import nbclient
 import nbformat
 import pytest
 
-from kslc_jax import plots, rewards
+from kslc_jax import records, rewards
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum", "04_own_robot")
@@ -99,8 +99,8 @@ def test_train_and_evaluate(execute, tmp_path):
     notebook = execute("02_train_and_evaluate")
     assert "no GPU: on one" in text(notebook)
     assert "resumed at train step 4" in text(notebook)
-    records = plots.read_metrics(tmp_path / "runs" / "notebook-debug")
-    assert list(records["step"]) == list(range(1, 9))
+    metrics = records.read_metrics(tmp_path / "runs" / "notebook-debug")
+    assert list(metrics["step"]) == list(range(1, 9))
     assert re.search(r"│\s+1\.0 │.*\n│\s+2\.0 │", text(notebook))
     assert pictures(notebook) == 3
 
@@ -114,9 +114,9 @@ def test_rewards_and_curriculum(execute):
         value = math.exp(-5.0 * v**2)
         line = f"commanded {v:.1f} m/s: reward {value:.1e}, slope {10.0 * v * value:.1e}"
         assert line in text(notebook)
-    stored = plots.read_metrics(ROOT / "docs" / "training" / "laptop-seed0.jsonl")
+    stored = records.read_metrics(ROOT / "docs" / "training" / "laptop-seed0.jsonl")
     assert len(re.findall("^v_max .* m/s from", text(notebook), re.M)) == len(
-        plots.milestones(stored)
+        records.milestones(stored)
     )
     assert pictures(notebook) == 13
 
@@ -130,8 +130,8 @@ def test_own_robot(execute, tmp_path, monkeypatch):
     assert "nothing looks wrong" in said and "soften them" in said
     assert re.search(r"gait.cycle_time +XBot-L +0.64 +biped +0.52", said)
     assert pictures(notebook) == 2
-    records = plots.read_metrics(tmp_path / "runs" / "notebook-own-robot")
-    assert list(records["step"]) == [1, 2, 3, 4]
+    metrics = records.read_metrics(tmp_path / "runs" / "notebook-own-robot")
+    assert list(metrics["step"]) == [1, 2, 3, 4]
 
 
 def test_the_reward_terms_shown_are_there_and_told():

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kslc_jax import plots
+from kslc_jax import plots, records
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def run_dir(tmp_path):
 
 
 def test_milestones(run_dir):
-    assert plots.milestones(plots.read_metrics(run_dir)) == [(1.0, 5000, 10.0)]
+    assert records.milestones(records.read_metrics(run_dir)) == [(1.0, 5000, 10.0)]
 
 
 def test_learning_curve_is_drawn(run_dir, tmp_path):
@@ -53,7 +53,7 @@ def evaluations(tmp_path):
 
 
 def test_seeds_of_a_method_belong_together(evaluations):
-    found = plots.read_evaluations(evaluations)
+    found = records.read_evaluations(evaluations)
     assert {name: len(seeds) for name, seeds in found.items()} == {"kslc": 2, "baseline": 1}
 
 
@@ -77,11 +77,11 @@ def test_learning_curves_are_drawn(tmp_path, capsys):
         (tmp_path / name).mkdir()
         (tmp_path / name / "learning.json").write_text(json.dumps({"run": name, "points": points}))
     runs = sorted(map(str, tmp_path.iterdir()))
-    assert {k: len(v) for k, v in plots.read_learning(list(tmp_path.iterdir())).items()} == {
+    assert {k: len(v) for k, v in records.read_learning(list(tmp_path.iterdir())).items()} == {
         "kslc": 2,
         "baseline": 1,
     }
-    kslc = plots.read_learning([*map(Path, runs)])["kslc"]
+    kslc = records.read_learning([*map(Path, runs)])["kslc"]
     assert [len(curve.env_steps) for curve in kslc] == [3, 3]
     np.testing.assert_allclose(kslc[0].reached[2], 0.4 * np.arange(5))
     out = tmp_path / "out.png"
@@ -108,7 +108,7 @@ def test_what_nobody_survived_leaves_a_gap(evaluations, tmp_path):
         ]
         path.write_text(json.dumps(content))
     figure, axis = plots.plt.subplots()
-    seeds = plots.read_evaluations(evaluations)["kslc"]
+    seeds = records.read_evaluations(evaluations)["kslc"]
     plots._over_commands(axis, "kslc", "C0", seeds, "forward_std")
     drawn = axis.lines[0].get_xydata()
     plots.plt.close(figure)
@@ -122,7 +122,43 @@ def test_sim2sim_files_are_evaluations_too(evaluations, tmp_path):
     content = json.loads(evaluations[0].read_text())
     path = tmp_path / "sim2sim.json"
     path.write_text(json.dumps({"conditions": {"nominal": content["rows"], "payload=5": []}}))
-    assert plots.read_evaluations([path]) == {"sim2sim": [content["rows"]]}
+    assert records.read_evaluations([path]) == {"sim2sim": [content["rows"]]}
+
+
+def drawn_texts(results, tmp_path, monkeypatch):
+    """The texts in the fields of the figure `conditions`."""
+    figures = []
+    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+    (tmp_path / "x.json").write_text(json.dumps({"conditions": results}))
+    assert plots.main(["conditions", str(tmp_path / "x.json")]) == 0
+    axis = figures[0].axes[0]
+    plots.plt.close(figures[0])
+    ticks = (axis.get_xticklabels(), axis.get_yticklabels())
+    labels = [[label.get_text() for label in row] for row in ticks]
+    return labels, [text.get_text() for text in axis.texts]
+
+
+def test_every_condition_is_a_row_of_a_figure(tmp_path, monkeypatch):
+    def row(command, survival, **more):
+        return {"command": command, "survival": survival, "forward_mean": 0.9 * command, **more}
+
+    results = {
+        "nominal": [row(1.0, 1.0), row(2.0, 1.0)],
+        "slope:10": [row(1.0, 0.5), {"command": 2.0, "survival": 0.0, "beyond": ["ground"]}],
+    }
+    labels, texts = drawn_texts(results, tmp_path, monkeypatch)
+    assert labels == [["1 m/s", "2 m/s"], ["nominal", "slope:10"]]
+    assert texts == ["100%\n0.90", "100%\n1.80", "50%\n0.90", "0%*"]
+    schedule = {"nominal": [{"schedule": "stop", "survival": 0.75}]}
+    labels, texts = drawn_texts(schedule, tmp_path, monkeypatch)
+    assert labels == [["stop"], ["nominal"]] and texts == ["75%"]
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '{"conditions": {}}', '{"conditions": {"a": []}}'])
+def test_no_conditions(content, tmp_path, capsys):
+    (tmp_path / "x.json").write_text(content)
+    assert plots.main(["conditions", str(tmp_path / "x.json")]) == 2
+    assert "holds no conditions" in capsys.readouterr().err
 
 
 def test_not_an_evaluation(tmp_path, capsys):

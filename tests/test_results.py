@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from kslc_jax import compare, plots
+from kslc_jax import compare, records
 from kslc_jax.evaluation import tables
 from kslc_jax.policy import POLICIES
 
@@ -104,8 +104,8 @@ def test_compare():
 
 def test_what_to_expect():
     """README's table and the policy's milestones agree with the stored training."""
-    records = plots.read_metrics(DOCS / "training" / "laptop-seed0.jsonl")
-    reached = plots.milestones(records)
+    metrics = records.read_metrics(DOCS / "training" / "laptop-seed0.jsonl")
+    reached = records.milestones(metrics)
     policy = json.loads((POLICIES / "xbot_l_run" / "milestones.json").read_text())
     assert {f"{v:g}": steps for v, steps, _ in reached} == policy
     lines = (DOCS.parent / "README.md").read_text().splitlines()

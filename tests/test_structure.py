@@ -42,7 +42,8 @@ LIGHT = (
     "sim2sim",
     "play",
 )
-LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "evaluation.tables")
+LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "records")
+LIGHT += ("evaluation.tables", "evaluation.perturbations")
 """Modules that do not import JAX, so that a config check and `--help` are quick."""
 
 
