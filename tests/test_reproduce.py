@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from kslc_jax import curriculum, files, networks, plots, reproduce, runtime
+from kslc_jax import curriculum, files, networks, records, reproduce, runtime
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import preset
 from kslc_jax.training import loop
@@ -94,7 +94,7 @@ def trained(shipped, monkeypatch):
             raise outcome["raises"]
         run_dir.mkdir(parents=True)
         rows = [
-            dict.fromkeys(plots.COLUMNS, 0.0) | {"env_steps": steps, "curriculum/v_max": v}
+            dict.fromkeys(records.COLUMNS, 0.0) | {"env_steps": steps, "curriculum/v_max": v}
             for steps, v in ((128, 0.5), (2900, 1.0))
         ]
         (run_dir / "metrics.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
