@@ -2,8 +2,9 @@
 
 A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fidelity: at each
 commanded speed, under random changes of the command from four starting headings, and with each
-perturbation of sim2sim. Prints one table: each bar, its required value, the worst measured value,
-and the condition of that value. The exit code is 0 even if the policy misses a bar. docs/sim2sim.md
+perturbation of sim2sim. A robot of another size than XBot-L gets other speeds and perturbations, by
+dynamic similarity. Prints one table: each bar, its required value, the worst measured value, and
+the condition of that value. The exit code is 0 even if the policy misses a bar. docs/sim2sim.md
 describes the measurements.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
@@ -27,8 +28,8 @@ import tyro
 from kslc_jax import cli, evaluate, files
 from kslc_jax.config import require_seed
 from kslc_jax.evaluation import tables
-from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
-from kslc_jax.evaluation.perturbations import ALL, changes, settings
+from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars, scaled
+from kslc_jax.evaluation.perturbations import ALL, changes, settings, similar
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
 """Commanded speeds [m/s]. No bar uses the last one; it is only reported."""
@@ -55,6 +56,16 @@ class Size:
     perturbed_speeds: tuple[float, ...]
     perturbed_seeds: int
     perturbed_seconds: float
+
+    def for_robot(self, length: float, mass: float) -> "Size":
+        """The size for a robot of this length and mass by XBot-L's: other speeds, perturbations."""
+        scale = math.sqrt(length)
+        return dataclasses.replace(
+            self,
+            speeds=tuple(scaled(speed, scale) for speed in self.speeds),
+            perturbations=tuple(similar(name, length, mass) for name in self.perturbations),
+            perturbed_speeds=tuple(scaled(speed, scale) for speed in self.perturbed_speeds),
+        )
 
 
 FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, PERTURBED_TOP), 4, 20.0)
@@ -103,6 +114,22 @@ class Args:
         return dataclasses.replace(QUICK if self.quick else FULL, **given)
 
 
+def size_for(args: Args, policy) -> Size:
+    """Size of the measurement for the policy's robot."""
+    from kslc_jax import physics
+
+    robot = physics.robot_for(policy.config.physics)
+    return args.size.for_robot(robot.length_ratio, robot.mass_ratio)
+
+
+def judged(results: "Results", policy) -> list[Bar]:
+    """The bars for the policy's robot, applied to the results of `measure`."""
+    from kslc_jax import physics
+
+    robot = physics.robot_for(policy.config.physics)
+    return bars(results, math.sqrt(robot.length_ratio), bool(robot.is_arm.any()))
+
+
 Results = dict[str, Any]
 Progress = Callable[[str, float], None]
 
@@ -123,7 +150,7 @@ def _speeds(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     from kslc_jax.evaluation import trials
     from kslc_jax.evaluation.measure import measure as measured
 
-    size = args.size
+    size = size_for(args, policy)
     plain = trials.Setting(trials.engine(policy, "high"), seconds=size.seconds)
 
     def told(share: float) -> None:
@@ -135,7 +162,7 @@ def _speeds(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
 def _schedules(args: Args, policy, progress: Progress) -> dict[str, list[dict[str, Any]]]:
     from kslc_jax.evaluation import scheduled, schedules, trials
 
-    size, found = args.size, {}
+    size, found = size_for(args, policy), {}
     schedule = schedules.named(SCHEDULE, policy.config, float(policy.curriculum.v_max))
     for i, heading in enumerate(size.headings):
 
@@ -158,7 +185,7 @@ def _perturbed(args: Args, policy, progress: Progress) -> dict[str, list[dict[st
     def speed(trace, command: float, robot, dt: float) -> dict[str, float]:
         return gait_metrics.speed(trace, command, dt)
 
-    size, found = args.size, {}
+    size, found = size_for(args, policy), {}
     plain = trials.Setting(trials.engine(policy, "high"), seconds=size.perturbed_seconds)
     for i, condition in enumerate(size.perturbations):
 
@@ -177,11 +204,11 @@ def _drake(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     from kslc_jax.evaluation import trials
     from kslc_jax.evaluation.measure import measure as measured
 
-    size = args.size
+    size = size_for(args, policy)
     setting = trials.Setting(
         trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
     )
-    speeds = [speed for speed in size.speeds if speed <= TOP]
+    speeds = [own for v, own in zip(args.size.speeds, size.speeds, strict=True) if v <= TOP]
     return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
 
 
@@ -220,7 +247,7 @@ def _report(args: Args) -> None:
     sim2sim.simulator("drake" if args.drake else "mujoco")
     policy = load_policy(args.policy)
     about: Results = {"policy": policy_name(args.policy), "step": policy.step, "quick": args.quick}
-    about |= {"seed": args.seed, "size": dataclasses.asdict(args.size)}
+    about |= {"seed": args.seed, "size": dataclasses.asdict(size_for(args, policy))}
 
     def keep(found: Results) -> None:
         if args.json is not None:
@@ -236,9 +263,9 @@ def _report(args: Args) -> None:
             bar.update(tasks[name], completed=share)
 
         found = measure(args, policy, progress, keep)
-    judged = bars(found)
-    keep(found | {"bars": [dataclasses.asdict(one) for one in judged]})
-    screen.print(table(judged, f"{args.policy}, train step {policy.step}"))
+    against = judged(found, policy)
+    keep(found | {"bars": [dataclasses.asdict(one) for one in against]})
+    screen.print(table(against, f"{args.policy}, train step {policy.step}"))
 
 
 if __name__ == "__main__":

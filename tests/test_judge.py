@@ -90,6 +90,40 @@ def test_what_was_not_measured_is_not_met():
     assert found["arm-leg correlation"].shown() == "-"
 
 
+def test_a_smaller_robot_has_slower_bars_and_one_without_arms_has_none_on_them():
+    """At a quarter of the length all speeds are half as fast; a speed beyond the top is no bar."""
+    results = good()
+    for part in (results["speeds"], results["perturbed"]["payload=5"]):
+        for line in part:
+            line |= {"command": line["command"] / 2, "forward_mean": line["forward_mean"] / 2}
+    found = bars(results, scale=0.5, arms=False)
+    assert len(found) == 11 and all(bar.met for bar in found)
+    assert found[0].name == "nobody falls, 0 to 2 m/s"
+    results["speeds"][3]["survival"] = 0.5
+    (missed,) = [bar for bar in bars(results, scale=0.5) if not bar.met]
+    assert missed.where == "2 m/s"
+
+
+def test_a_robot_of_another_size_is_tried_at_its_own_speeds():
+    """Lengths scale with l, speeds with sqrt(l), masses with m, torques with m l."""
+    assert judge.FULL.for_robot(1.0, 1.0) == judge.FULL
+    small = judge.FULL.for_robot(0.25, 0.5)
+    assert small.speeds == (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25)
+    assert small.perturbed_speeds == (0.5, 1.0, 1.5) and small.headings == judge.HEADINGS
+    theirs = dict(zip(judge.ALL, small.perturbations, strict=True))
+    changed = {
+        "payload=-5": "payload=-2.5",
+        "payload=5": "payload=2.5",
+        "com=-0.02": "com=-0.005",
+        "com=0.02": "com=0.005",
+        "push=0.5": "push=0.25",
+        "hands=0.5": "hands=0.25",
+        "sole=0.02": "sole=0.005",
+        "joints=1": "joints=0.12",
+    }
+    assert theirs == dict(zip(judge.ALL, judge.ALL, strict=True)) | changed
+
+
 def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, capsys):
     """One table, JSON, and exit code 0 though a bar is missed."""
 

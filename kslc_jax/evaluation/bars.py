@@ -1,4 +1,7 @@
-"""The bars that a policy must meet, applied to the results of `kslc_jax.judge`. Pure Python."""
+"""The bars that a policy must meet, applied to the results of `kslc_jax.judge`. Pure Python.
+
+Speeds below are those of XBot-L. For another robot they are scaled.
+"""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -34,46 +37,56 @@ class Bar:
         return "-" if self.value is None else f"{self.value:.3g}"
 
 
-def bars(results: dict[str, Any]) -> list[Bar]:
+def bars(results: dict[str, Any], scale: float = 1.0, arms: bool = True) -> list[Bar]:
     """Compares the results with all bars.
 
     Args:
       results: of `judge.measure`. "speeds": rows by commanded speed; "schedules" and "perturbed":
         rows by condition; "drake": rows by commanded speed, only with --drake.
+      scale: factor on the commanded speeds, see `scaled`.
+      arms: True if the robot has arms. Without arms there is no bar on them.
     """
+    slowest, gait_top, perturbed_top, top = (
+        scaled(speed, scale) for speed in (SLOWEST, GAIT_TOP, PERTURBED_TOP, TOP)
+    )
     speeds: list[Row] = results["speeds"]
-    gait, calm = _between(speeds, SLOWEST, TOP), _between(speeds, SLOWEST, GAIT_TOP)
-    flight = [row for row in speeds if row["command"] == GAIT_TOP]
+    gait, calm = _between(speeds, slowest, top), _between(speeds, slowest, gait_top)
+    flight = [row for row in speeds if row["command"] == gait_top]
     rest = [row for row in speeds if row["command"] == 0.0]
     found = [
-        _at_least(f"nobody falls, 0 to {TOP:g} m/s", 1.0, _upright(_between(speeds, 0.0, TOP))),
+        _at_least(f"nobody falls, 0 to {top:g} m/s", 1.0, _upright(_between(speeds, 0.0, top))),
         _at_most(
-            f"speed error, {SLOWEST:g} to {TOP:g} m/s, share", 0.03, _each(gait, _speed_error)
+            f"speed error, {slowest:g} to {top:g} m/s, share", 0.03, _each(gait, _speed_error)
         ),
         _at_most("speed at command 0 [m/s]", 0.03, _each(rest, _creep)),
         _at_most("strides a second at command 0", 0.05, _of(rest, "stride_frequency")),
         _at_least("nobody falls, random schedule", 1.0, _by_condition(results["schedules"])),
         _at_least(
-            f"joints within speed limits, to {GAIT_TOP:g} m/s",
+            f"joints within speed limits, to {gait_top:g} m/s",
             0.99,
             _of(calm, "within_speed_limits"),
         ),
-        _at_most("arm-leg correlation", -0.5, _of(gait, "shoulder_hip_correlation")),
+        *[_at_most("arm-leg correlation", -0.5, _of(gait, "shoulder_hip_correlation"))] * arms,
         _at_most("left-right difference", 0.05, _each(gait, _asymmetry)),
-        _at_most(f"lateral std, to {GAIT_TOP:g} m/s [m/s]", 0.1, _of(calm, "lateral_std")),
-        _at_most(f"yaw-rate std, to {GAIT_TOP:g} m/s [rad/s]", 0.25, _of(calm, "yaw_rate_std")),
-        _at_least(f"flight at {GAIT_TOP:g} m/s", 0.1, _of(flight, "flight_share")),
+        _at_most(f"lateral std, to {gait_top:g} m/s [m/s]", 0.1, _of(calm, "lateral_std")),
+        _at_most(f"yaw-rate std, to {gait_top:g} m/s [rad/s]", 0.25, _of(calm, "yaw_rate_std")),
+        _at_least(f"flight at {gait_top:g} m/s", 0.1, _of(flight, "flight_share")),
         _at_least(
-            f"nobody falls, perturbed, to {PERTURBED_TOP:g} m/s",
+            f"nobody falls, perturbed, to {perturbed_top:g} m/s",
             1.0,
             _by_condition(results["perturbed"]),
         ),
     ]
     if "drake" in results:
         found.append(
-            _at_least(f"nobody falls, Drake, to {TOP:g} m/s", 1.0, _upright(results["drake"]))
+            _at_least(f"nobody falls, Drake, to {top:g} m/s", 1.0, _upright(results["drake"]))
         )
     return found
+
+
+def scaled(speed: float, scale: float) -> float:
+    """A commanded speed [m/s] for a robot that moves `scale` times as fast as XBot-L."""
+    return round(speed * scale, 2)
 
 
 Measured = list[tuple[float, str]]
