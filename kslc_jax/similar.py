@@ -66,6 +66,7 @@ def factors(robot: Robot) -> dict[str, float]:
         "gait.cycle_from_speed": time,
         "curriculum.v_min": time,
         "curriculum.v_start": time,
+        "curriculum.gait_from": time,
         "curriculum.v_step": time,
         "curriculum.v_limit": time,
         "curriculum.cycle_min": time,

@@ -216,6 +216,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "curriculum.settle_seconds": 2.0,
         "curriculum.v_limit": 4.5,
         "curriculum.gait_threshold": 0.75,
+        "curriculum.gait_from": 0.75,
         "curriculum.top_error": 0.05,
         "curriculum.top_falls": 1.0,
         "curriculum.cycle_factor": 0.925,
@@ -546,6 +547,7 @@ LATER_FIELDS = {
     "rewards.exact_from": 0.5,
     "rewards.exact_full": 2.5,
     "curriculum.gait_threshold": -1.0,
+    "curriculum.gait_from": 0.0,
     "randomize.noise": (1.0, 1.0),
     "run.snapshots": 24,
 }

@@ -90,6 +90,16 @@ def test_a_shuffle_does_not_open_the_gate():
     assert float(curriculum.update(DIRECT, state(**READY), progress(gait=-0.3)).v_max) == 1.0
 
 
+def test_the_first_range_may_grow_before_the_feet_follow_the_clock():
+    """Below `gait_from` the gate does not look at the gait."""
+    strict = dataclasses.replace(DIRECT, gait_threshold=0.65, gait_from=0.75)
+    first = curriculum.update(strict, state(**READY), progress(gait=0.5))
+    assert float(first.v_max) == 1.0
+    for gait, v_max in ((0.5, 1.0), (0.66, 1.5)):
+        ready = state(**READY).replace(v_max=first.v_max)
+        assert float(curriculum.update(strict, ready, progress(gait=gait)).v_max) == v_max
+
+
 STRICT = dataclasses.replace(DIRECT, top_error=0.05, top_falls=1.0)
 
 

@@ -75,6 +75,7 @@ _LAPTOP = _override(
         "settle_seconds": 2.0,
         "v_limit": 4.5,
         "gait_threshold": 0.75,
+        "gait_from": 0.75,
         "top_error": 0.05,
         "top_falls": 1.0,
         "cycle_factor": 0.925,

@@ -517,6 +517,8 @@ class CurriculumConfig:
     """Mean of the term `feet_contact_number` that fast commands must reach. The term is 1 if both
     feet follow the clock and -0.3 if none does. A shuffling gait can track speed too; this excludes
     it. -1: no condition."""
+    gait_from: float = 0.0
+    """The gate looks at the gait while v_max [m/s] >= gait_from."""
     top_error: float = 1e9
     """Largest relative error of the mean speed under commands in the top `v_step` of the range. The
     range does not grow before the robot can run its top speed. 1e9: no condition."""

@@ -19,8 +19,8 @@ CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
 SHOWN_GROUP = 2
 """Highest geom group that is drawn, as in MuJoCo's own viewer."""
 
-GROUND_COLOR = (214, 218, 224)
-"""Colour of uneven ground: red, green, blue."""
+GROUND_COLORS = ((226, 229, 233), (178, 184, 194))
+"""The two colours of uneven ground: red, green, blue."""
 
 
 class Figure:
@@ -84,10 +84,9 @@ class Figure:
     def _add_ground(self, scene: viser.SceneApi) -> None:
         """Adds the windows of the height field; `show` makes one of them visible."""
         self._windows = [
-            scene.add_mesh_simple(
+            scene.add_mesh_trimesh(
                 f"/world/ground_{i}",
-                *shapes.ground(self._model, i),
-                color=GROUND_COLOR,
+                shapes.checkered(*shapes.ground(self._model, i), GROUND_COLORS),
                 visible=False,
             )
             for i in range(self._model.nhfield)

@@ -14,6 +14,9 @@ GAMMA = 2.2
 COARSER = 2
 """Distance of the points of the drawn ground by that of the height field."""
 
+SQUARE = 0.5
+"""Side [m] of the squares on uneven ground."""
+
 
 def mesh(model: mujoco.MjModel, geom: int) -> trimesh.Trimesh:
     """The mesh of a geom, in the frame of its body and the colour of its material."""
@@ -57,3 +60,10 @@ def ground(model: mujoco.MjModel, field: int) -> tuple[np.ndarray, np.ndarray]:
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]
     faces = np.stack([a, b, d, a, d, c], -1).reshape(-1, 3)
     return vertices.astype(np.float32), faces.astype(np.uint32)
+
+
+def checkered(vertices: np.ndarray, faces: np.ndarray, colors) -> trimesh.Trimesh:
+    """A ground with squares of two colours. On ground of one colour nobody would see the waves."""
+    column, row = np.floor(vertices[:, :2].T / SQUARE).astype(int)
+    painted = np.asarray(colors, np.uint8)[(column + row) % 2]
+    return trimesh.Trimesh(vertices, faces, vertex_colors=painted, process=False)
