@@ -383,3 +383,10 @@ def test_the_drawn_ground_is_the_ground(kind, place):
     corners = vertices[faces]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (normal[:, 2] > 0).all()
+
+
+def test_the_drawn_ground_has_squares_of_two_colours():
+    corners = np.array([(0.1, 0.1), (0.6, 0.1), (0.6, 0.6), (-0.1, 0.1)])
+    light, dark = (255, 255, 255), (10, 20, 30)
+    mesh = shapes.checkered(np.c_[corners, np.zeros(4)], np.array([[0, 1, 2]]), (light, dark))
+    np.testing.assert_array_equal(mesh.visual.vertex_colors[:, :3], [light, dark, light, dark])
