@@ -386,6 +386,9 @@ def test_the_drawn_ground_is_the_ground(kind, place):
 
 
 def test_the_drawn_ground_has_squares_of_two_colours():
+    shapes = pytest.importorskip(
+        "kslc_jax.viewer.shapes", reason="the extra 'viewer' is not installed"
+    )
     corners = np.array([(0.1, 0.1), (0.6, 0.1), (0.6, 0.6), (-0.1, 0.1)])
     light, dark = (255, 255, 255), (10, 20, 30)
     mesh = shapes.checkered(np.c_[corners, np.zeros(4)], np.array([[0, 1, 2]]), (light, dark))
