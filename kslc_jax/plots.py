@@ -324,10 +324,9 @@ def schedules(rows: list[dict], out: Path) -> None:
 
 def _save(figure, out: Path) -> None:
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=130)
-    except OSError as error:
-        raise ValueError(f"cannot write {out}: {error.strerror or error}") from error
+        files.require_writable(out)
+        with files.saving(out) as part:
+            figure.savefig(part, dpi=130)
     finally:
         plt.close(figure)
 
@@ -385,7 +384,13 @@ class Schedules:
 
 
 def draw(args: Training | Learning | Performance | Momentum | Schedules) -> None:
-    """Draws the figure of `args`; ValueError if its data are missing or unreadable."""
+    """Draws the figure of `args`.
+
+    Raises:
+      ValueError: its data are missing or unreadable.
+      ConfigError: the file cannot be written.
+    """
+    files.require_suffix(args.out, files.FIGURES)
     if isinstance(args, Schedules):
         return schedules(read_schedules(args.results), args.out)
     if not (args.runs if isinstance(args, Training | Learning) else args.evaluations):
