@@ -307,8 +307,8 @@ def main(argv: list[str] | None = None) -> int:
 
 def _compare(args: Args) -> int:
     """Runs all jobs and reports; returns the exit code."""
-    if args.keep:
-        files.require_writable(args.keep / files.EVALUATION)
+    for folder in filter(None, (args.out, args.keep)):
+        files.require_writable(folder / files.EVALUATION)
     try:
         failed, refused = run_all(args)
     except KeyboardInterrupt:

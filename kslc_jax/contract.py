@@ -30,17 +30,21 @@ SIDEWAYS, HEADING = 0.1, 0.3
 """Commanded sideways velocity [m/s] and heading [rad] of the second golden trial."""
 
 
-def write(policy: Policy, out: Path) -> list[Path]:
-    """Writes the data (.json), the robot (.xml) and a golden trace (.npz) beside `out`.
+def paths(out: Path) -> list[Path]:
+    """The files beside `out`: the data (.json), the robot (.xml) and a golden trace (.npz)."""
+    return [out.with_suffix(suffix) for suffix in (".json", ".xml", ".npz")]
 
-    Returns the three paths.
-    """
-    beside = [out.with_suffix(suffix) for suffix in (".json", ".xml", ".npz")]
+
+def write(policy: Policy, out: Path) -> list[Path]:
+    """Writes the files beside `out`; returns `paths`."""
+    data, model, trace = beside = paths(out)
     budget = policy.config.env.action_delay * policy.config.control_dt
-    files.write_json(beside[0], metadata(policy) | {"latency_budget": budget})
-    beside[1].write_text(mjcf(policy), encoding="utf-8")
-    trace: dict[str, Any] = golden(policy)
-    np.savez_compressed(beside[2], **trace)
+    files.write_json(data, metadata(policy) | {"latency_budget": budget})
+    with files.saving(model) as part:
+        part.write_text(mjcf(policy), encoding="utf-8")
+    numbers: dict[str, Any] = golden(policy)
+    with files.saving(trace) as part:
+        np.savez_compressed(part, **numbers)
     return beside
 
 

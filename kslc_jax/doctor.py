@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from kslc_jax import cli, runtime
+from kslc_jax import cli, files, runtime
 from kslc_jax.config import ConfigError
 
 PYTHONS = ((3, 11), (3, 13))
@@ -53,6 +53,9 @@ class Robot:
     """Draws limbs, joint axes, soles and trunk at home into this file, such as robot.png."""
     engines: bool = True
     """Compare MJX with C MuJoCo; it compiles for a minute or more."""
+
+    def __post_init__(self):
+        files.require_suffix(self.picture, files.FIGURES)
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,7 @@ def _run(args: Check | Robot | Replay) -> int:
     if isinstance(args, Robot):
         from kslc_jax.checkup import report
 
+        files.require_writable(args.picture)
         report.check(args.name, args.picture, args.engines)
         return 0
     from kslc_jax.training.replay import replay

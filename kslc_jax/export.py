@@ -14,6 +14,7 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +26,6 @@ import tyro
 
 from kslc_jax import __version__, cli, contract, files
 from kslc_jax.config import Config, ConfigError
-from kslc_jax.errors import UserError
 
 if TYPE_CHECKING:
     from kslc_jax.networks import Params, Parity
@@ -61,11 +61,18 @@ class Args:
             raise ConfigError(
                 f"out: '{self.out.name}' ends in neither .onnx nor .stablehlo; say it with --format"
             )
+        if self.out in self.written[1:]:
+            raise ConfigError(f"out: {self.out} has the name of a file that is written beside it")
 
     @property
     def chosen(self) -> str:
         """The given format, or the suffix of OUT."""
         return self.format or self.out.suffix[1:]
+
+    @property
+    def written(self) -> list[Path]:
+        """The files or the folder that the command writes, OUT first."""
+        return [self.out] if self.chosen == "orbax" else [self.out, *contract.paths(self.out)]
 
 
 # ------------------------------------------------------------------------------------------- onnx
@@ -289,15 +296,12 @@ def _export(args: Args) -> None:
     """Writes the policy, and compares the file with the policy."""
     from kslc_jax.policy import load_policy
 
-    try:
-        if args.chosen == "orbax":
-            args.out.parent.mkdir(parents=True, exist_ok=True)
-        else:
-            files.require_writable(args.out)
-        policy = load_policy(args.policy)
-        _write(policy, args)
-    except OSError as error:
-        raise UserError(str(error)) from error
+    if args.chosen == "orbax" and os.path.exists(args.out):
+        raise ConfigError(f"cannot write {args.out}: it is there already; name a new folder")
+    for path in args.written:
+        files.require_writable(path)
+    policy = load_policy(args.policy)
+    _write(policy, args)
     print(f"wrote {args.out}, train step {policy.step}")
     print(compare(policy, args.out, args.chosen))
 
@@ -308,7 +312,8 @@ def _write(policy: Policy, args: Args) -> None:
     if args.chosen == "orbax":
         save_policy(policy, args.out)
         return
-    args.out.write_bytes(WRITE[args.chosen](policy))
+    with files.saving(args.out) as part:
+        part.write_bytes(WRITE[args.chosen](policy))
     contract.write(policy, args.out)
 
 

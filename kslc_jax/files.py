@@ -3,12 +3,16 @@
 If a file cannot be written, the error has one line.
 """
 
+import contextlib
+import errno
 import json
 import os
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
 
 from kslc_jax.config import ROBOT_FOLDER, ConfigError
+from kslc_jax.runtime import first_line
 
 # ------------------------------------------------------------------- names within a run folder
 
@@ -73,44 +77,90 @@ def seeds_in(run_dir: Path) -> list[int]:
 
 # ------------------------------------------------------------------------------------- writing
 
+FIGURES = (".png", ".jpg", ".webp", ".svg", ".pdf")
+"""Suffixes of the figures of `plots` and `doctor`."""
+
 
 def _target(path: Path) -> Path:
     """The path that a link points to, even if it does not exist yet; otherwise the path itself."""
     return Path(os.path.realpath(path))
 
 
-def write_atomically(path: Path, text: str) -> None:
-    """Writes a file in one step: at any time `path` has either the old text or the new text.
+def _is_device(path: Path) -> bool:
+    """True for what is there and no file, such as /dev/stdout; a folder counts, too."""
+    return path.exists() and not path.is_file()
 
-    If `path` is a link, it stays a link, and its target gets the text.
+
+def _part(target: Path) -> Path:
+    """Where the new content of a file waits; it has the same suffix."""
+    return target.with_name(f".{target.stem}.part{target.suffix}")
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Generator[Path]:
+    """Gives the path of a file to write; at the end that file replaces `path` in one step.
+
+    At any time `path` has either the old content or the new content. After an error the old file is
+    unchanged. If `path` is a link, it stays a link, and its target gets the content. A device such
+    as /dev/stdout is written directly.
     """
-    path = _target(path)
-    part = path.with_name(f".{path.name}.part")
+    if _is_device(path):
+        yield path
+        return
+    target = _target(path)
     try:
-        part.write_text(text)
-        os.replace(part, path)
-    except OSError:
-        part.unlink(missing_ok=True)
+        yield _part(target)
+        os.replace(_part(target), target)
+    except BaseException:  # Ctrl-C, too
+        with contextlib.suppress(OSError):
+            _part(target).unlink()
         raise
 
 
+def write_atomically(path: Path, text: str) -> None:
+    """Writes a file in one step, see `replacing`."""
+    with replacing(path) as part:
+        part.write_text(text)
+
+
+@contextlib.contextmanager
+def saving(path: Path) -> Generator[Path]:
+    """`replacing` for a result that a user has asked for: ConfigError if it cannot be written."""
+    try:
+        with replacing(path) as part:
+            yield part
+    except OSError as error:
+        raise ConfigError(f"cannot write {path}: {error.strerror or first_line(error)}") from error
+
+
 def require_writable(path: Path | None) -> None:
-    """Makes the folder of a result; ConfigError if the result cannot be written there."""
+    """Makes the folder of a result; ConfigError if the result cannot be written there.
+
+    Call it before work that takes long.
+    """
     if path is None:
         return
     try:
-        folder = _target(path).parent
-        folder.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if path.exists() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        if not _is_device(path):
+            target = _target(path)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            _part(target).touch()
+            _part(target).unlink()
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
-    if path.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        raise ConfigError(f"cannot write {path}")
+
+
+def require_suffix(path: Path | None, kinds: Sequence[str]) -> None:
+    """ConfigError if the name of a result ends in none of `kinds`, such as .png."""
+    if path is not None and path.suffix.lower() not in kinds:
+        raise ConfigError(f"{path}: its name must end in {' or '.join(kinds)}")
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes numbers as JSON; ConfigError if that fails. The old file is then unchanged."""
-    special = path.exists() and not path.is_file()  # such as /dev/stdout
-    try:
-        (Path.write_text if special else write_atomically)(path, json.dumps(content, indent=1))
-    except OSError as error:
-        raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+    with saving(path) as part:
+        part.write_text(json.dumps(content, indent=1))

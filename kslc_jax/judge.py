@@ -15,6 +15,7 @@ Examples:
   python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --drake
 """
 
+import contextlib
 import dataclasses
 import math
 import sys
@@ -26,7 +27,7 @@ from typing import Any
 import tyro
 
 from kslc_jax import cli, evaluate, files
-from kslc_jax.config import require_seed
+from kslc_jax.config import ConfigError, require_seed
 from kslc_jax.evaluation import tables
 from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars, scaled
 from kslc_jax.evaluation.perturbations import ALL, changes, settings, similar
@@ -253,6 +254,10 @@ def _report(args: Args) -> None:
         if args.json is not None:
             files.write_json(args.json, about | found)
 
+    def keep_part(found: Results) -> None:
+        with contextlib.suppress(ConfigError):  # a full disk may have room again in the end
+            keep(found)
+
     screen = tables.console()
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in PARTS}
@@ -262,10 +267,10 @@ def _report(args: Args) -> None:
             bar.start_task(tasks[name])
             bar.update(tasks[name], completed=share)
 
-        found = measure(args, policy, progress, keep)
+        found = measure(args, policy, progress, keep_part)
     against = judged(found, policy)
-    keep(found | {"bars": [dataclasses.asdict(one) for one in against]})
     screen.print(table(against, f"{args.policy}, train step {policy.step}"))
+    keep(found | {"bars": [dataclasses.asdict(one) for one in against]})
 
 
 if __name__ == "__main__":

@@ -98,6 +98,7 @@ def _write(args: Args) -> None:
     """Evaluates the policies of every run and writes learning.json into the run folders."""
     for run in args.runs:
         snapshots(run)
+        files.require_writable(run / files.LEARNING)
     with Progress(transient=True) as bar:
         for run in args.runs:
             task = bar.add_task(str(run), total=1.0)

@@ -106,8 +106,7 @@ class Args:
             raise ConfigError("top is the fastest command of a schedule: give --schedule too")
         videos = films.FILMS + films.ANIMATIONS
         for path, kinds in ((self.gait_strip, STRIPS), (self.video, videos)):
-            if path is not None and path.suffix.lower() not in kinds:
-                raise ConfigError(f"{path}: its name must end in {' or '.join(kinds)}")
+            files.require_suffix(path, kinds)
         if self.engine != "mujoco" and self.fidelity != "high":
             raise ConfigError(f"engine: {self.engine} takes the robot at --fidelity high only")
         if self.terrain and self.engine != "mujoco":
@@ -193,8 +192,6 @@ def draw(args: Args, policy) -> None:
 
     from kslc_jax.viewer import render
 
-    for path in (args.gait_strip, args.video):
-        files.require_writable(path)
     if args.video is not None and args.video.suffix.lower() in films.FILMS:
         films.film_writer()
     trace, start, dt = record(args, policy)
@@ -209,10 +206,12 @@ def draw(args: Args, policy) -> None:
             render.gait_strip(robot, trace.qpos[s, i], dt, ground=films.ground_of(trace, s, i))
             for i, s in enumerate(spans)
         ]
-        matplotlib.image.imsave(args.gait_strip, render.stack(strips))
+        with files.saving(args.gait_strip) as part:
+            matplotlib.image.imsave(part, render.stack(strips))
         print(f"wrote {args.gait_strip}")
     if args.video is not None:
-        films.write_video(args.video, robot, trace, spans, dt)
+        with files.saving(args.video) as part:
+            films.write_video(part, robot, trace, spans, dt)
         print(f"wrote {args.video}")
 
 
@@ -255,6 +254,8 @@ def _play(args: Args) -> None:
         watch(args)
         return
     runtime.choose_gl()  # before anything that imports mujoco
+    for path in (args.gait_strip, args.video):
+        files.require_writable(path)
     sim2sim.simulator(args.engine)  # fails now if the engine's package is missing
     from kslc_jax.policy import load_policy
 

@@ -23,7 +23,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import tyro
 
-from kslc_jax import cli, records
+from kslc_jax import cli, files, records
 from kslc_jax.cli import Paths
 from kslc_jax.errors import UserError
 from kslc_jax.records import Curve, Records
@@ -226,10 +226,9 @@ def conditions(results: dict[str, list[dict]], out: Path) -> None:
 
 def _save(figure, out: Path) -> None:
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=130)
-    except OSError as error:
-        raise ValueError(f"cannot write {out}: {error.strerror or error}") from error
+        files.require_writable(out)
+        with files.saving(out) as part:
+            figure.savefig(part, dpi=130)
     finally:
         plt.close(figure)
 
@@ -300,7 +299,13 @@ Figure = Training | Learning | Performance | Momentum | Schedules | Conditions
 
 
 def draw(args: Figure) -> None:
-    """Draws the figure of `args`; ValueError if its data are missing or unreadable."""
+    """Draws the figure of `args`.
+
+    Raises:
+      ValueError: its data are missing or unreadable.
+      ConfigError: the file cannot be written.
+    """
+    files.require_suffix(args.out, files.FIGURES)
     if isinstance(args, Schedules):
         return schedules(records.read_schedules(args.results), args.out)
     if isinstance(args, Conditions):

@@ -174,6 +174,7 @@ def _compare(args: Args) -> int:
     """Compares and reports; the exit code is 1 if a number lies outside its band."""
     if args.train:
         runtime.require_good_jax()
+        files.require_writable(args.run_dir / files.CONFIG)
     try:
         rows = repeat(args)
     except Stopped as stopped:

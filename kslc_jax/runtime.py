@@ -178,7 +178,7 @@ def choose_gl() -> None:
 
 
 def quiet() -> None:
-    """Silences error reports of libraries, and prints Python warnings in one line.
+    """Silences error reports of libraries, and prints Python warnings and Ctrl-C in one line.
 
     This package reports these errors itself. The function changes the whole process, so only
     commands call it.
@@ -193,7 +193,9 @@ def quiet() -> None:
 def _excepthook(
     kind: type[BaseException], error: BaseException, trace: TracebackType | None
 ) -> None:
-    if str(error) != "Event loop is closed":
+    if issubclass(kind, KeyboardInterrupt):
+        print("interrupted", file=sys.stderr)  # then Python ends as the signal ends a process
+    elif str(error) != "Event loop is closed":
         sys.__excepthook__(kind, error, trace)
 
 

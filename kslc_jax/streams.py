@@ -48,13 +48,16 @@ def open_missing() -> None:
     """Opens /dev/null for standard input, output or error if the process started without them.
 
     Otherwise the next opened file, such as a checkpoint, would take the free descriptor, and
-    libraries would print into it.
+    libraries would print into it. Python's streams, None until then, are opened, too.
     """
-    for number in (0, 1, 2):
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free descriptor
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, "w" if number else "r")  # noqa: SIM115 (until the end)
+            setattr(sys, name, stream)
 
 
 class Output:

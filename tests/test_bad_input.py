@@ -6,12 +6,15 @@ import copy
 import errno
 import io
 import json
+import os
+import re
 import string
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import family
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,6 +39,7 @@ from kslc_jax import (
     train_step,
 )
 from kslc_jax import policy as policy_lib
+from kslc_jax.checkup import report
 from kslc_jax.config import PRESETS, ConfigError, preset, to_dict
 from kslc_jax.training import checkpoint
 
@@ -243,9 +247,10 @@ def test_policy_loads_from_a_path_with_anything_in_it(policy):
 
 PICTURE = ("--gait-strip", "strip.png")
 COMMANDS = [(evaluate.main, ()), (sim2sim.main, ()), (play.main, PICTURE)]
+NAMES = ["evaluate", "sim2sim", "play"]
 
 
-@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=["evaluate", "sim2sim", "play"])
+@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=NAMES)
 class TestPolicyCommands:
     @pytest.fixture(autouse=True)
     def any_renderer(self, monkeypatch):
@@ -297,15 +302,11 @@ def test_a_disk_that_fills_up_in_the_end_is_named_and_the_old_numbers_stay(tmp_p
     assert json.loads(kept.read_text()) == {"rows": [1]}
 
 
-@pytest.mark.parametrize(
-    "module",
-    [compare, doctor, evaluate, export, learning, play, plots, reproduce, sim2sim, train],
-    ids=lambda module: module.__name__,
-)
-def test_usage_is_what_is_typed(module, capsys):
+@pytest.mark.parametrize("name", family.COMMANDS)
+def test_usage_is_what_is_typed(name, capsys):
     with pytest.raises(SystemExit):
-        module.main(["--help"])
-    assert f"usage: python -m {module.__name__} " in capsys.readouterr().out
+        family.main(name)(["--help"])
+    assert f"usage: python -m kslc_jax.{name} " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("main", "figure"), [(learning.main, []), (plots.main, ["performance"])])
@@ -361,6 +362,116 @@ def test_numbers_are_not_lost_to_a_link_that_leads_to_itself(tmp_path):
     files.require_writable(link)
     files.write_json(link, {"rows": [1]})
     assert json.loads(link.read_text()) == {"rows": [1]}
+
+
+WRITERS = {
+    "evaluate": "evaluate xbot_l_run --json OUT.json",
+    "sim2sim": "sim2sim xbot_l_run --json OUT.json",
+    "judge": "judge xbot_l_run --json OUT.json",
+    "strip": "play xbot_l_run --gait-strip OUT.png",
+    "video": "play xbot_l_run --video OUT.webp",
+    "export": "export xbot_l_run OUT.onnx",
+    "data": "export xbot_l_run OUT.json/../a.onnx",  # a.json, beside the network
+    "orbax": "export xbot_l_run OUT.d --format orbax",
+    "doctor": "doctor robot xbot_l --picture OUT.png",
+    "compare": "compare --out OUT.d",
+    "keep": "compare --keep OUT.d",
+    "reproduce": "reproduce --train --run-dir OUT.d",
+    "learning": "learning OUT.d",
+}
+"""Commands that work for long and then write OUT. An OUT.d is a folder to make."""
+
+
+class TestResults:
+    """Files that commands write. What cannot be written is told before the work."""
+
+    @pytest.fixture(autouse=True)
+    def no_work(self, monkeypatch, tmp_path):
+        """Commands that begin to work fail with another error."""
+
+        def late(*_: Any, **__: Any) -> Any:
+            raise AssertionError("the work begins")
+
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(policy_lib, "load_policy", late)
+        monkeypatch.setattr(compare, "run_all", late)
+        monkeypatch.setattr(report, "check", late)
+        monkeypatch.setattr(learning, "curve", late)
+        monkeypatch.setattr(learning, "snapshots", lambda run: [])
+
+    def argv(self, name: str, out: Path | str) -> tuple[Any, list[str]]:
+        command, *argv = WRITERS[name].split()
+        return family.main(command), [x.replace("OUT", str(out)) for x in argv]
+
+    @pytest.mark.parametrize("name", WRITERS)
+    def test_below_a_file(self, name, tmp_path):
+        (tmp_path / "file").touch()
+        main, argv = self.argv(name, "file/x")
+        assert "cannot write file/x" in refused(main, *argv)
+
+    @pytest.mark.parametrize("name", WRITERS)
+    def test_a_folder_or_a_file_in_its_place(self, name, tmp_path):
+        main, argv = self.argv(name, "x")
+        for suffix in ("json", "png", "webp", "onnx"):
+            (tmp_path / f"x.{suffix}").mkdir()
+        (tmp_path / "a.json").mkdir()
+        (tmp_path / "x.d").touch()
+        assert re.search(r"cannot write (x|a)\.|a\.json", refused(main, *argv))
+
+    @pytest.mark.parametrize("name", WRITERS)
+    def test_a_name_too_long(self, name):
+        main, argv = self.argv(name, "x" * 300)
+        assert "File name too long" in refused(main, *argv)
+
+    @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+    @pytest.mark.parametrize("name", WRITERS)
+    def test_a_folder_that_cannot_be_written(self, name, tmp_path):
+        (tmp_path / "mine").mkdir(mode=0o555)
+        main, argv = self.argv(name, "mine/x")
+        assert "Permission denied" in refused(main, *argv)
+
+    @pytest.mark.parametrize(
+        "where", ["there/is/none/x", "../up/x", "with space/läuft 机器人/x", "link/x"]
+    )
+    @pytest.mark.parametrize("name", WRITERS)
+    def test_any_other_path(self, name, where, tmp_path):
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+        main, argv = self.argv(name, where)
+        with pytest.raises(AssertionError, match="the work begins"):
+            main(argv)
+        left = [path for path in tmp_path.parent.rglob("*") if path.is_file()]
+        assert not [path for path in left if ".part" in path.name]
+
+    def test_the_old_file_survives_an_error_and_ctrl_c(self, tmp_path):
+        old = tmp_path / "x.png"
+        old.write_text("old")
+        for error in (KeyboardInterrupt, OSError(errno.ENOSPC, "No space left on device")):
+            with pytest.raises((KeyboardInterrupt, ConfigError)), files.saving(old) as part:
+                part.write_text("half")
+                raise error
+            assert old.read_text() == "old" and list(tmp_path.iterdir()) == [old]
+
+    def test_a_file_that_can_be_written_in_a_folder_that_cannot(self, tmp_path, monkeypatch):
+        """The new content needs a second file beside it."""
+
+        def denied(path: Path) -> None:
+            raise PermissionError(errno.EACCES, "Permission denied")
+
+        (tmp_path / "x.json").touch()
+        monkeypatch.setattr(Path, "touch", denied)
+        with pytest.raises(ConfigError, match=r"x\.json: Permission denied"):
+            files.require_writable(tmp_path / "x.json")
+
+    @pytest.mark.parametrize("out", ["p.json", "p.xml", "p.npz"])
+    def test_a_network_with_the_name_of_its_data(self, out):
+        said = refused(export.main, "xbot_l_run", out, "--format", "onnx")
+        assert f"{out} has the name of a file that is written beside it" in said
+
+    @pytest.mark.parametrize("out", ["curve", "curve.xyz"])
+    def test_a_figure_without_a_suffix(self, out, tmp_path):
+        assert "must end in .png" in refused(plots.main, "training", tmp_path, "--out", out)
+        assert "must end in .png" in refused(doctor.main, "robot", "xbot_l", "--picture", out)
 
 
 class TestPlay:

@@ -40,6 +40,14 @@ def test_any_other_error_keeps_its_traceback():
         cli.run(failing(ZeroDivisionError()))
 
 
+def test_ctrl_c_is_one_line_and_ends_a_script_or_cell(process, capsys):
+    """Python then ends by the signal, so that a shell's loop over commands ends, too."""
+    with pytest.raises(KeyboardInterrupt):
+        cli.run(failing(KeyboardInterrupt()))
+    sys.excepthook(KeyboardInterrupt, KeyboardInterrupt(), None)
+    assert capsys.readouterr().err == "interrupted\n"
+
+
 def test_exit_codes():
     assert cli.run(lambda: None) == 0
     assert cli.run(lambda: 130) == 130

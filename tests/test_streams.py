@@ -1,17 +1,16 @@
 """Commands whose output is closed or cannot be written."""
 
-import importlib
+import contextlib
 import io
 import os
 import subprocess
 import sys
 
+import family
 import pytest
 
 from kslc_jax import cli, streams
-
-COMMANDS = ["train", "evaluate", "sim2sim", "play", "export", "plots", "compare", "learning"]
-COMMANDS += ["reproduce", "doctor", "judge"]
+from kslc_jax.evaluation import tables
 
 
 @pytest.fixture
@@ -44,11 +43,40 @@ def test_a_command_goes_on_without_its_reader(closed):
     assert sys.stdout is before
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_without_a_reader(name, closed):
+@pytest.fixture
+def missing(monkeypatch):
+    """Python's streams in a process that was started with closed descriptors: CMD >&- 2>&-"""
+    for name in ("stdout", "stderr", "__stdout__", "__stderr__"):
+        monkeypatch.setattr(sys, name, None)
+
+
+def test_all_commands_are_tried():
+    assert {"train", "evaluate", "sim2sim", "judge", "play", "export", "plots"} < set(
+        family.COMMANDS
+    )
+    assert {"compare", "learning", "reproduce", "doctor"} < set(family.COMMANDS)
+
+
+@pytest.mark.parametrize("how", ["closed", "missing"])
+@pytest.mark.parametrize("name", family.COMMANDS)
+def test_help_without_a_reader(name, how, request):
+    request.getfixturevalue(how)
     with pytest.raises(SystemExit) as end:
-        importlib.import_module(f"kslc_jax.{name}").main(["--help"])
+        family.main(name)(["--help"])
     assert end.value.code == 0
+
+
+@pytest.mark.parametrize("how", ["closed", "missing"])
+@pytest.mark.parametrize("name", family.COMMANDS)
+def test_an_error_without_a_reader(name, how, request):
+    request.getfixturevalue(how)
+    with contextlib.suppress(SystemExit):  # tyro's, for an option that there is not
+        assert family.main(name)(["--seed", "x", "--out", "", "--preset", "x"]) == 2
+
+
+def test_a_table_without_a_stream(missing):
+    assert cli.run(lambda: tables.console().print("table")) == 0
+    assert sys.stdout is not None  # libraries write to it
 
 
 def test_help_into_head():

@@ -14,8 +14,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from scipy.spatial import ConvexHull, QhullError
 
+from kslc_jax import files
 from kslc_jax.checkup import statics
-from kslc_jax.errors import UserError
 from kslc_jax.robot import Robot
 from kslc_jax.robots import shapes
 from kslc_jax.robots.build import SIDES
@@ -54,7 +54,7 @@ def draw(robot: Robot, out: Path) -> None:
       out: a file that matplotlib can write, such as robot.png.
 
     Raises:
-      UserError: the file cannot be written.
+      ConfigError: the file cannot be written.
     """
     data = statics.posed(robot, statics.on_the_ground(robot))
     figure, axes = plt.subplots(1, 2, figsize=(8, 8.5), sharey=True, layout="constrained")
@@ -64,10 +64,8 @@ def draw(robot: Robot, out: Path) -> None:
     figure.suptitle(f"{robot.name} at home: {robot.count} joints, {robot.total_mass:.1f} kg")
     figure.legend(handles=_legend(robot), loc="outside lower center", ncols=5, fontsize=8)
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=100)
-    except (OSError, ValueError) as error:
-        raise UserError(f"cannot write {out}: {error}") from None
+        with files.saving(out) as part:
+            figure.savefig(part, dpi=100)
     finally:
         plt.close(figure)
 
