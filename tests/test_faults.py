@@ -46,7 +46,7 @@ from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.checkup import trials
 from kslc_jax.config import XBOT_L, preset, to_dict
 from kslc_jax.robots import description
-from kslc_jax.training import recovery, run_folder
+from kslc_jax.training import memory, recorder, recovery, run_folder
 from kslc_jax.training.checkpoint import Store
 from kslc_jax.training.logs import MetricsFile
 
@@ -75,6 +75,13 @@ def either(request, made):
 
 
 @pytest.fixture(scope="module")
+def healthy(either):
+    """The numbers of the environments after the first train step."""
+    init, step = either
+    return numbers(step(init())[0].env)
+
+
+@pytest.fixture(scope="module")
 def like():
     """Shapes of the debug preset's state."""
     return jax.eval_shape(lambda: train_step.init(DEBUG, 0))
@@ -89,7 +96,8 @@ def state_at(like):
             return jax.random.key(0)
         return jnp.asarray(np.random.default_rng(0).normal(size=x.shape), x.dtype)
 
-    return lambda step: jax.tree.map(leaf, like).replace(step=jnp.asarray(step, jnp.int32))
+    state = jax.tree.map(leaf, like)
+    return lambda step: state.replace(step=jnp.asarray(step, jnp.int32))
 
 
 def numbers(tree):
@@ -130,31 +138,30 @@ class TestEnvironments:
     """A bad environment loses its samples only. Update, curriculum and other environments stay
     good."""
 
-    def assert_contained(self, either, where, value, rows, lost):
+    def assert_contained(self, either, healthy, where, value, rows, lost):
         init, step = either
-        healthy, _ = step(init())
         new, metrics = step(put(init(), f"env.{where}", value, rows))
         assert all(np.isfinite(x).all() for x in numbers(new) if x.dtype.kind == "f")
         assert all(np.isfinite(value) for value in metrics.values())
         assert metrics["broken"] == lost / DEBUG.batch_size
         assert metrics["ppo/skipped"] == 0 and metrics["finite"] == 1
         others = np.delete(np.arange(DEBUG.env.num_envs), rows)
-        keep = lambda state: jax.tree.map(lambda x: x[others], state.env)  # noqa: E731
-        assert same(keep(new), keep(healthy))
+        kept = [[x[others] for x in environments] for environments in (numbers(new.env), healthy)]
+        assert same(*kept)
 
     @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
     @pytest.mark.parametrize("where", SEEN_AT_ONCE)
-    def test_one(self, either, where, value):
-        self.assert_contained(either, where, value, slice(3, 4), lost=1)
+    def test_one(self, either, healthy, where, value):
+        self.assert_contained(either, healthy, where, value, slice(3, 4), lost=1)
 
     @pytest.mark.parametrize("where", SEEN_AT_ONCE)
-    def test_all(self, either, where):
-        self.assert_contained(either, where, jnp.nan, slice(None), lost=DEBUG.env.num_envs)
+    def test_all(self, either, healthy, where):
+        self.assert_contained(either, healthy, where, jnp.nan, slice(None), lost=DEBUG.env.num_envs)
 
     @pytest.mark.parametrize(("where", "lost"), SEEN_LATER.items())
-    def test_overflow_in_mid_rollout(self, either, where, lost):
+    def test_overflow_in_mid_rollout(self, either, healthy, where, lost):
         """The state is finite at the start, so that the step itself makes the bad number."""
-        self.assert_contained(either, where, 1e30, slice(3, 4), lost)
+        self.assert_contained(either, healthy, where, 1e30, slice(3, 4), lost)
 
 
 class TestLearner:
@@ -200,32 +207,57 @@ class TestLearner:
 # ------------------------------------------------------------------------------------- going back
 
 
+@pytest.fixture(scope="module")
+def counting(like, state_at):
+    """Gives the command line with a train step that only counts: `training` below."""
+    shapes, finite = memory.shapes(DEBUG), jax.jit(rollout.finite)
+    whole, none = state_at(0), {"none": jnp.zeros(1)}
+    small = whole.replace(env=none, learner=whole.learner.replace(opt_state=none))
+
+    def make(monkeypatch, folder):
+        def run(poison, *args):
+            class Step:
+                lower = compile = lambda self, *_: self
+
+                def __call__(self, state):
+                    run.step = int(state.step) + 1
+                    state = poison(state)
+                    metrics = METRICS | {
+                        "finite": finite(state.learner.params),
+                        "ppo/skipped": jnp.isinf(state.learner.learning_rate),
+                        "broken": run.broken(run.step - 1),
+                    }
+                    return state.replace(step=state.step + 1), metrics
+
+            first = whole if run.whole else small
+            monkeypatch.setattr(train_step, "make", lambda config: (lambda: first, Step()))
+            rarely = ["--run.checkpoint-minutes", "60", "--run.snapshots", "0"]
+            options = ["--preset", "debug", "--run-dir", run.dir, *rarely, *args]
+            return train.main([str(x) for x in options])
+
+        due = recorder.Recorder.due
+        monkeypatch.setattr(
+            recorder.Recorder, "due", lambda self: due(self) or run.step in run.saved_at
+        )
+        # The step that counts has the shapes of the debug preset; tracing others takes seconds.
+        monkeypatch.setattr(memory, "shapes", lambda config: shapes)
+        run.dir = folder
+        run.whole = False  # True: with environments and optimiser, which a dump must have
+        run.saved_at = ()  # train steps with a checkpoint, besides the first and the last one
+        run.broken = lambda step: 0.0  # share of the samples, after so many train steps
+        return run
+
+    return make
+
+
 @pytest.fixture
-def training(state_at, tmp_path, monkeypatch):
+def training(counting, tmp_path, monkeypatch):
     """Runs the command line with a train step that only counts. `poison(state)` runs before it.
 
     The metrics report a NaN parameter as not finite, and an infinite learning rate as a skipped
-    update."""
-
-    def run(poison, *args):
-        class Step:
-            lower = compile = lambda self, *_: self
-
-            def __call__(self, state):
-                state = poison(state)
-                finite = rollout.finite(state.learner.params)
-                skipped = jnp.isinf(state.learner.learning_rate)
-                broken = run.broken(int(state.step))
-                metrics = METRICS | {"finite": finite, "ppo/skipped": skipped, "broken": broken}
-                return state.replace(step=state.step + 1), metrics
-
-        monkeypatch.setattr(train_step, "make", lambda config: (lambda: state_at(0), Step()))
-        often = ["--run.checkpoint-minutes", "1e-9", *map(str, args)]
-        return train.main(["--preset", "debug", "--run-dir", str(run.dir), *often])
-
-    run.dir = tmp_path / "r"
-    run.broken = lambda step: 0.0  # share of the samples, after so many train steps
-    return run
+    update. Each checkpoint takes most of a second, so there are few, and no snapshots. It takes
+    time for each array, so the state is small."""
+    return counting(monkeypatch, tmp_path / "r")
 
 
 def nan_actor(state):
@@ -244,7 +276,8 @@ class TestGoingBack:
             seen.append(int(state.step))
             return nan_actor(state) if seen[-1] == 5 and seen.count(5) == 1 else state
 
-        assert training(poison) == 0
+        training.saved_at = range(5, 8)
+        assert training(poison, "--run.snapshots", 8) == 0
         out = capsys.readouterr().out
         assert "warning: the learner or the curriculum is not finite; back to train step 5" in out
         assert "attempt 1 of 3" in out and "done: 8 train steps, saved" in out
@@ -256,6 +289,7 @@ class TestGoingBack:
         def poison(state):
             return nan_actor(state) if int(state.step) == 5 else state
 
+        training.saved_at, training.whole = range(5, 9), True
         assert training(poison) == 1
         said = capsys.readouterr()
         assert [f"attempt {i} of 3" in said.out for i in (1, 2, 3, 4)] == [True] * 3 + [False]
@@ -272,6 +306,7 @@ class TestGoingBack:
             rate = state.learner.learning_rate if int(state.step) < 3 else jnp.inf
             return put(state, "learner.learning_rate", rate, ...)
 
+        training.saved_at, training.whole = range(3, 9), True
         assert training(poison) == 1
         said = capsys.readouterr()
         assert "not one finite gradient in 3 train steps; back to train step 3" in said.out
@@ -326,11 +361,10 @@ class TestBrokenSamples:
     """Many are said, and all of them for long end a training; both patience 10 train steps."""
 
     LONG = ("--steps", 40 * 128)
-    RARE = (*LONG, "--run.checkpoint-minutes", 100)  # 40 checkpoints would take a minute
 
     def test_ten_train_steps_with_many_are_said_once(self, training, capsys):
         training.broken = lambda step: 0.02 if 5 <= step < 30 else 0.01
-        assert training(lambda state: state, *self.RARE) == 0
+        assert training(lambda state: state, *self.LONG) == 0
         out = capsys.readouterr().out
         assert out.count("warning: ") == 1 and "done: 40 train steps" in out
         assert "in each of the last 10 train steps more than 1% of the samples were broken" in out
@@ -338,16 +372,17 @@ class TestBrokenSamples:
 
     def test_a_second_spell_is_said_again(self, training, capsys):
         training.broken = lambda step: 0.0 if step == 15 else 0.5
-        assert training(lambda state: state, *self.RARE) == 0
+        assert training(lambda state: state, *self.LONG) == 0
         assert capsys.readouterr().out.count("warning: ") == 2
 
     def test_nine_are_not(self, training, capsys):
         training.broken = lambda step: 0.0 if step % 10 == 9 else 0.99
-        assert training(lambda state: state, *self.RARE) == 0
+        assert training(lambda state: state, *self.LONG) == 0
         assert "warning" not in capsys.readouterr().out
 
     def test_all_for_long_end_it_with_one_line(self, training, capsys):
         training.broken = lambda step: 1.0 if step >= 5 else 0.0
+        training.saved_at, training.whole = range(5, 41), True
         assert training(lambda state: state, *self.LONG) == 1
         said = capsys.readouterr()
         assert "every sample was broken in 10 train steps; back to train step 5" in said.out
@@ -358,6 +393,7 @@ class TestBrokenSamples:
 
     def test_a_short_training_is_not_done_either(self, training, capsys):
         training.broken = lambda step: 1.0
+        training.saved_at = range(1, 9)
         assert training(lambda state: state) == 1
         said = capsys.readouterr()
         assert (
@@ -422,7 +458,10 @@ class TestAround:
 
     def test_in_a_thread(self, training, capsys):
         codes = []
-        thread = threading.Thread(target=lambda: codes.append(training(lambda state: state)))
+        snapshots = ("--run.snapshots", 2)
+        thread = threading.Thread(
+            target=lambda: codes.append(training(lambda state: state, *snapshots))
+        )
         thread.start()
         thread.join()
         assert codes == [0] and "done: 8 train steps" in capsys.readouterr().out
@@ -431,7 +470,7 @@ class TestAround:
         """A cell runs within an event loop; its output has no file descriptor."""
 
         async def cell():
-            first = training(lambda state: state)
+            first = training(lambda state: state, "--run.snapshots", 2)
             return first, training(lambda state: state, "--resume", "--steps", 1280)
 
         assert asyncio.run(cell()) == (0, 0)
@@ -444,18 +483,26 @@ def files_of(folder):
     return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
 
 
+@pytest.fixture(scope="module")
+def finished(counting, tmp_path_factory):
+    """The run folder of a training of 8 train steps, 1024 environment steps."""
+    folder = tmp_path_factory.mktemp("finished") / "r"
+    with pytest.MonkeyPatch.context() as patch:
+        assert counting(patch, folder)(lambda state: state) == 0
+    return folder
+
+
 class TestResume:
     """What --resume says, and what it keeps."""
 
     @pytest.fixture
-    def done(self, training, capsys):
-        """Goes on with a training of 8 train steps, 1024 environment steps; what it says."""
-        rarely = ("--run.checkpoint-minutes", 60)  # each checkpoint takes most of a second
-        assert training(lambda state: state, *rarely) == 0
+    def done(self, finished, training, capsys):
+        """Goes on with a copy of the finished training; what it says."""
+        shutil.copytree(finished, training.dir)
 
         def resume(*args, code=0):
             capsys.readouterr()
-            assert training(lambda state: state, *rarely, "--resume", *args) == code
+            assert training(lambda state: state, "--resume", *args) == code
             said = capsys.readouterr()
             return said.err if code else said.out
 
@@ -560,17 +607,35 @@ def longest_file(size):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-@pytest.fixture
-def saved(state_at):
-    """Fills a run folder with checkpoints."""
+@pytest.fixture(scope="module")
+def save(state_at):
+    """Writes checkpoints of these train steps into a run folder."""
 
-    def save(run_dir, *steps):
+    def write(run_dir, *steps):
         with contextlib.closing(Store(run_dir)) as store:
             for step in steps:
                 store.save(state_at(step), DEBUG, METRICS | {"step": step})
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def written(save, tmp_path_factory):
+    """Gives a run folder with the checkpoints of these train steps. It is written once."""
+
+    @functools.cache
+    def folder(*steps):
+        run_dir = tmp_path_factory.mktemp("written")
+        save(run_dir, *steps)
         return run_dir
 
-    return save
+    return folder
+
+
+@pytest.fixture
+def saved(written):
+    """Fills a run folder with copies of checkpoints, which a test may damage."""
+    return lambda run_dir, *steps: shutil.copytree(written(*steps), run_dir, dirs_exist_ok=True)
 
 
 @pytest.fixture
@@ -586,9 +651,10 @@ def restored(like):
     return restore
 
 
-def test_no_checkpoint_names_a_folder(saved, restored, tmp_path):
+def test_no_checkpoint_names_a_folder(save, restored, tmp_path):
     """Run folders are published. Orbax would write where they were."""
-    stored = [path for path in saved(tmp_path, 1, 2).rglob("*") if path.is_file()]
+    save(tmp_path, 1, 2)
+    stored = [path for path in tmp_path.rglob("*") if path.is_file()]
     assert len(stored) > 20 and not [p for p in stored if bytes(tmp_path) in p.read_bytes()]
     assert restored(tmp_path) == (2, [])
 
@@ -630,7 +696,8 @@ class TestFullDisk:
                 filler.unlink()
             return state
 
-        assert training(poison, "--run.keep", 1, "--run.snapshots", 0) == 0
+        training.saved_at = (4, 5, 7)
+        assert training(poison, "--run.keep", 1) == 0
         out = capsys.readouterr().out
         assert "warning: could not save a checkpoint" in out and "training goes on" in out
         assert steps_of(disk) == list(range(1, 9))
@@ -683,14 +750,14 @@ def flip_bits(folder):
 
 class TestDamage:
     @pytest.mark.parametrize("item", ["params", "core", "env"])
-    def test_flipped_bits(self, saved, restored, tmp_path, item):
+    def test_flipped_bits(self, saved, save, restored, tmp_path, item):
         """The bits are in the numbers, where orbax itself finds no error."""
         saved(tmp_path, 1, 2)
         flip_bits(tmp_path / "checkpoints" / "2" / item / "ocdbt.process_0" / "d")
         step, (warning,) = restored(tmp_path)
         assert step == 1 and "checkpoint 2 is damaged" in warning and "1 is used" in warning
         assert {p.name for p in (tmp_path / "checkpoints").iterdir()} == {"1", "damaged-2"}
-        saved(tmp_path, 2)  # the damaged folder does not prevent the save
+        save(tmp_path, 2)  # the damaged folder does not prevent the save
         assert restored(tmp_path) == (2, [])
 
     @pytest.mark.parametrize("item", ["params", "core", "env", "meta"])

@@ -31,8 +31,19 @@ def blank(like):
     return jnp.zeros((COUNT, *like.shape), like.dtype)
 
 
-def first_state():
-    return jax.tree.map(blank, jax.eval_shape(lambda: train_step.init(DEBUG, 0)))
+@pytest.fixture(scope="module")
+def like():
+    """Shapes of the state of one seed.
+
+    It has no environments and no optimiser, because a checkpoint takes time for each array."""
+    state = jax.eval_shape(lambda: train_step.init(DEBUG, 0))
+    none = {"none": jax.ShapeDtypeStruct((1,), jnp.float32)}
+    return state.replace(env=none, learner=state.learner.replace(opt_state=none))
+
+
+@pytest.fixture(scope="module")
+def first_state(like):
+    return jax.tree.map(blank, like)
 
 
 def records(folder):
@@ -48,11 +59,19 @@ def steps_of(folder):
 
 
 @pytest.fixture
-def training(tmp_path, monkeypatch):
+def training(first_state, tmp_path, monkeypatch):
     """Runs the command line with a program that only counts; its learning rate is its reward.
 
-    `poison(state)` runs before each train step. Seeds with a NaN rate are not finite.
+    `poison(state)` runs before each train step. Seeds with a NaN rate are not finite. The
+    checkpoints of three seeds take more than a second, so there are few, and no snapshots.
     """
+    due = recorder.Recorder.due
+    monkeypatch.setattr(
+        recorder.Recorder, "due", lambda self: due(self) or run.step in run.saved_at
+    )
+
+    def one_first_state():
+        return seeds.one_of(first_state, 0)
 
     def run(poison=lambda state: state, *args):
         class Step:
@@ -61,17 +80,21 @@ def training(tmp_path, monkeypatch):
             def __call__(self, state):
                 state = poison(state)
                 state = state.replace(step=state.step + 1)
+                run.step = int(state.step.max())
                 rate = state.learner.learning_rate
                 metrics = {name: np.full(COUNT, value) for name, value in METRICS.items()}
                 metrics |= {"step": state.step, "finite": jnp.isfinite(rate), "reward": rate}
                 return state, metrics
 
-        monkeypatch.setattr(seeds, "make", lambda config, count: (first_state, Step()))
-        often = ["--run.checkpoint-minutes", "1e-9", *map(str, args)]
-        return train.main(["--preset", "debug", "--run-dir", str(run.dir), *often])
+        monkeypatch.setattr(seeds, "make", lambda config, count: (lambda: first_state, Step()))
+        monkeypatch.setattr(train_step, "make", lambda config: (one_first_state, None))
+        rarely = ["--run.checkpoint-minutes", "60", "--run.snapshots", "0"]
+        options = ["--preset", "debug", "--run-dir", run.dir, *rarely, *args]
+        return train.main([str(x) for x in options])
 
     run.dir = tmp_path / "r"
     run.folders = [run.dir / f"seed-{i}" for i in range(COUNT)]
+    run.saved_at = ()  # train steps with checkpoints, besides the first and the last one
     return run
 
 
@@ -96,22 +119,23 @@ def bad_from(step, *which):
     return poison
 
 
-def test_each_seed_leaves_an_ordinary_run(training, capsys):
-    assert training(lambda state: state, "--seeds", COUNT, "--seed", 0) == 0
+def test_each_seed_leaves_an_ordinary_run(training, like, capsys):
+    snapshots = ("--run.snapshots", 2)
+    assert training(lambda state: state, "--seeds", COUNT, "--seed", 0, *snapshots) == 0
     out = capsys.readouterr().out
     assert "3 seeds, each with 16 environments x 8 steps" in out and "3 seeds, " in out
     assert sorted(p.name for p in training.dir.iterdir()) == ["seed-0", "seed-1", "seed-2"]
     for seed, folder in enumerate(training.folders):
-        assert run_folder.read_config(folder) == dataclasses.replace(DEBUG, seed=seed)
+        config = run_folder.read_config(folder)
+        assert config == dataclasses.replace(DEBUG, seed=seed, run=config.run)
         assert json.loads((folder / files.VERSIONS).read_text())["seeds"] == COUNT
         assert steps_of(folder) == list(range(1, STEPS + 1))
         assert checkpoint.Store(folder).steps()[-1] == STEPS
-        assert len(list((folder / files.SNAPSHOTS).iterdir())) == STEPS
+        kept = sorted(path.name for path in (folder / files.SNAPSHOTS).iterdir())
+        assert kept == [str(STEPS // 2), str(STEPS)]
         policy = policy_lib.load_policy(folder)
         assert (policy.config.seed, policy.step) == (seed, STEPS)
-        stored = checkpoint.Store(folder).restore(
-            jax.eval_shape(lambda: train_step.init(DEBUG, 0)), print
-        )
+        stored = checkpoint.Store(folder).restore(like, print)
         assert np.array_equal(jax.random.key_data(stored.key), [0, seed])
 
 
@@ -132,6 +156,7 @@ def test_a_stopped_training_goes_on_as_a_whole(training, capsys):
 
 def test_a_kill_between_two_saves_leaves_seeds_at_different_steps(training, capsys):
     """Each goes on from its own checkpoint; one without any begins. No record is lost or double."""
+    training.saved_at = (3,)
     assert training(stop_at(3), "--seeds", COUNT) == 0
     shutil.rmtree(training.folders[1] / files.CHECKPOINTS / "4")
     shutil.rmtree(training.folders[2] / files.CHECKPOINTS)
@@ -143,6 +168,7 @@ def test_a_kill_between_two_saves_leaves_seeds_at_different_steps(training, caps
 
 
 def test_a_bad_seed_stops_alone_and_is_named(training, capsys):
+    training.saved_at = (3, 4)
     assert training(bad_from(3, 1), "--seeds", COUNT) == 1
     out, err = capsys.readouterr()
     said = "seed-1: warning: the learner or the curriculum is not finite at train step 4"
@@ -162,6 +188,7 @@ def test_a_bad_seed_stops_alone_and_is_named(training, capsys):
 
 def test_a_bad_seed_far_behind_does_not_keep_the_others(training, capsys):
     """They end at their last train step, and then nobody waits for the bad one."""
+    training.saved_at = (2, 3)
     assert training(stop_at(3), "--seeds", COUNT) == 0
     for step in "34":
         shutil.rmtree(training.folders[0] / files.CHECKPOINTS / step)
@@ -182,6 +209,7 @@ def test_a_seed_that_cannot_be_saved_does_not_end_the_others(training, monkeypat
         finish(self, state, record)
 
     monkeypatch.setattr(recorder.Recorder, "finish", fails)
+    training.saved_at = (3, STEPS - 1)
     assert training(stop_at(3), "--seeds", COUNT) == 2
     assert capsys.readouterr().err == "error: no space\n"
     assert [checkpoint.Store(folder).steps()[-1] for folder in training.folders] == [3, 4, 4]
