@@ -47,7 +47,7 @@ class Figure:
         server.initial_camera.fov = np.radians(FOV)
         self._world = scene.add_frame("/world", show_axes=False)
         self._bodies = {}
-        self._windows: list[viser.MeshHandle] = []
+        self._windows: list[viser.GlbHandle] = []
         for geom in range(model.ngeom):
             body = int(model.geom_bodyid[geom])
             link = model.body(body).name
