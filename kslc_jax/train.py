@@ -188,7 +188,8 @@ def _seeds_there(args: Args, run_dir: Path) -> int:
     there, first = files.seeds_in(run_dir), args.config.seed
     count = max(len(there), 1)
     if args.seeds not in (1, count):
-        raise ConfigError(f"--seeds: {run_dir} holds {len(there)} seeds, not {args.seeds}")
+        held = f"{len(there)} seeds" if there else "a training of one seed"
+        raise ConfigError(f"--seeds: {run_dir} holds {held}, not {args.seeds} seeds")
     if there and there != [*range(first, first + count)]:
         raise ConfigError(
             f"{run_dir} holds the seeds {', '.join(map(str, there))}, not {count} in a row from "

@@ -313,6 +313,10 @@ def test_a_policy_takes_its_robot_along(mine, untrained, tmp_path):
     assert len(stored) > 5 and not [p for p in stored if bytes(tmp_path) in p.read_bytes()]
     policy.save_policy(loaded, tmp_path / "again")
     assert policy.load_policy(tmp_path / "again").config != loaded.config  # its own copy
+    shutil.rmtree(tmp_path / "again" / "robot")
+    said = r"again .*: its robot is missing, robot/biped\.toml: copy the folder robot of its run"
+    with pytest.raises(checkpoint_format.CheckpointError, match=said):
+        policy.load_policy(tmp_path / "again")
 
 
 def test_a_training_keeps_its_robot(mine, tmp_path):
@@ -326,6 +330,10 @@ def test_a_training_keeps_its_robot(mine, tmp_path):
     assert str(tmp_path) not in (run / "config.json").read_text()
     run_folder.difference(kept, setup)
     run_folder.open_folder(run, kept, True, {})
+    (run / "robot").rename(run / "robots")
+    with pytest.raises(config.ConfigError, match=f"copy the folder robot of its run to {run}"):
+        run_folder.read_config(run)
+    (run / "robots").rename(run / "robot")
     stronger = home / "stronger" / "biped.toml"  # in another place: descriptions are cached
     stronger.parent.mkdir()
     stronger.write_text(about.read_text().replace("kp = 60", "kp = 66"))

@@ -456,6 +456,42 @@ class TestAround:
         assert f"stopped by {name} at train step 4, saved" in capsys.readouterr().out
         assert Store(training.dir).steps()[-1] == 4
 
+    @pytest.mark.parametrize(
+        ("name", "at", "last"),
+        [("SIGUSR1", 4, 5), ("SIGTERM", 4, 6), ("SIGUSR1", 8, 8), ("SIGTERM", 8, 8)],
+    )
+    def test_signals_while_it_saves(self, name, at, last, training, monkeypatch, capsys):
+        """Nothing is lost. SIGUSR1 comes twice: before the save that begins after train step `at`,
+        and before the wait for it, which is after the next one. SIGTERM comes at the wait."""
+        save, wait, sent = Store.save, Store.wait, []
+
+        def send():
+            if name == "SIGUSR1" or not sent:
+                sent.append(name)
+                signal.raise_signal(getattr(signal, name))
+
+        def noisy_save(store, state, *rest):
+            store.noisy = int(state.step) == at
+            if store.noisy and name == "SIGUSR1":
+                send()
+            save(store, state, *rest)
+
+        def noisy_wait(store):
+            if store.__dict__.pop("noisy", False):
+                send()
+            wait(store)
+
+        monkeypatch.setattr(Store, "save", noisy_save)
+        monkeypatch.setattr(Store, "wait", noisy_wait)
+        assert training(lambda state: state) == 0
+        said = "done: 8 train" if last == 8 else f"stopped by {name} at train step {last}"
+        assert said in capsys.readouterr().out and sent
+        monkeypatch.setattr(Store, "save", save)
+        monkeypatch.setattr(Store, "wait", wait)
+        assert Store(training.dir).steps()[-1] == last
+        assert training(lambda state: state, "--resume", "--steps", 1280) == 0
+        assert steps_of(training.dir) == list(range(1, 11))
+
     def test_in_a_thread(self, training, capsys):
         codes = []
         snapshots = ("--run.snapshots", 2)
@@ -801,12 +837,14 @@ class TestSchema:
 
     def test_training_of_schema_1_says_why_not(self, tmp_path, capsys):
         run = shutil.copytree(self.OLD, tmp_path / "run")
+        (run / "versions.json").write_text('{"jax": "0.1.0"}')
+        before = files_of(run)
         assert train.main(["--resume", "--run-dir", str(run)]) == 2
         line = the_error(capsys)
         ours = checkpoint_format.SCHEMA_VERSION
         assert f"checkpoint schema 1, this kslc_jax goes on from {ours}" in line
         assert "--start-from" in line
-        assert [p.name for p in (run / "checkpoints").iterdir()] == ["1"]
+        assert files_of(run) == before
 
     def test_tree_of_this_schema(self, like):
         """A change of the tree needs a new SCHEMA_VERSION. Else old checkpoints fail with errors of

@@ -13,7 +13,7 @@ import pytest
 from processes import METRICS
 from rich.console import Console
 
-from kslc_jax import checkpoint_format, files, train, train_step
+from kslc_jax import checkpoint_format, config, files, train, train_step
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import preset
 from kslc_jax.training import checkpoint, recorder, run_folder, seeds
@@ -237,9 +237,36 @@ def test_folders_in_use_or_full_are_refused(training, capsys):
     assert "seed-2 is in use" in capsys.readouterr().err
     assert training(lambda state: state, "--resume", "--seeds", 2) == 2
     assert "holds 3 seeds, not 2" in capsys.readouterr().err
+    assert training(lambda state: state, "--seeds", COUNT, "--seed", COUNT) == 2
+    assert "r already holds a training of 3 seeds: go on with --resume --run-dir " in (
+        capsys.readouterr().err
+    )
+    with pytest.raises(run_folder.RunError, match="r already holds a training of 3 seeds"):
+        run_folder.open_folder(training.dir, DEBUG, False, {})
+    assert sorted(training.dir.iterdir()) == training.folders
     shutil.rmtree(training.folders[1])
     assert training(lambda state: state, "--resume") == 2
     assert "holds the seeds 0, 2" in capsys.readouterr().err
+
+
+def test_seeds_do_not_hide_in_the_folder_of_a_run(training, capsys):
+    """--resume would go on with the run alone."""
+    training.dir.mkdir()
+    (training.dir / files.CONFIG).write_text("{}")
+    (training.dir / files.METRICS).write_text("{}\n{}\n")
+    assert training(lambda state: state, "--seeds", COUNT) == 2
+    assert "r already holds a training: go on with" in capsys.readouterr().err
+    assert training(lambda state: state, "--resume", "--seeds", COUNT) == 2
+    (training.dir / files.CONFIG).write_text(json.dumps(config.to_dict(DEBUG)))
+    capsys.readouterr()
+    assert training(lambda state: state, "--resume", "--seeds", COUNT) == 2
+    assert "holds a training of one seed, not 3 seeds" in capsys.readouterr().err
+
+
+def test_more_seeds_than_memory(training, capsys):
+    assert training(lambda state: state, "--seeds", "1e9") == 2
+    assert "error: --seeds, env.num_envs, " in capsys.readouterr().err
+    assert not training.dir.exists()
 
 
 @pytest.mark.parametrize(
@@ -257,9 +284,9 @@ def test_what_cannot_be_combined(other, tmp_path, capsys):
         train.parse(["--preset", "debug", "--seeds", "2", "--run-dir", str(tmp_path), *other])
 
 
-@pytest.mark.parametrize("seeds", [0, -1, 2**31])
+@pytest.mark.parametrize("seeds", [0, -1, 2**31, "2.5", "many"])
 def test_numbers_of_seeds(seeds):
-    with pytest.raises(train.ConfigError, match="--seeds"):
+    with pytest.raises(train.UserError, match="--seeds"):
         train.parse(["--preset", "debug", "--seeds", str(seeds), "--seed", "1"])
 
 

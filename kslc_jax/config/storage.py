@@ -41,9 +41,22 @@ def find_robot(robot: str, folder: Path) -> str:
     Args:
       robot: `physics.robot` of a stored config.
       folder: run folder, or folder of a policy.
+
+    Raises:
+      ConfigError: `robot` is a description, and neither of these files exists.
     """
-    copy = folder.absolute() / ROBOT_FOLDER / Path(robot).name
-    return str(copy) if is_description(robot) and copy.is_file() else robot
+    if not is_description(robot):
+        return robot
+    name = Path(robot).name
+    copy = folder.absolute() / ROBOT_FOLDER / name
+    if copy.is_file():
+        return str(copy)
+    require(
+        Path(robot).is_file(),
+        f"its robot is missing, {ROBOT_FOLDER}/{name}: copy the folder {ROBOT_FOLDER} of its run "
+        f"to {folder}",
+    )
+    return robot
 
 
 def from_dict(data: dict[str, Any], folder: Path | None = None) -> Config:

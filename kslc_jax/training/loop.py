@@ -244,7 +244,7 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
 
 def _farewell(job: _Job, step: int, stopped_by: str | None, whole: bool) -> None:
     saved = "saved" if whole else "not saved: the numbers are not finite"
-    if stopped_by:
+    if stopped_by and step < job.config.num_updates:
         job.progress.say(
             f"stopped by {stopped_by} at train step {step}, {saved}; go on with: "
             f"python -m kslc_jax.train --resume --run-dir {shlex.quote(str(job.run_dir))}"

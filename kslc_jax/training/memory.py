@@ -118,7 +118,8 @@ def check(config: Config, devices: int = 1, seeds: int = 1) -> None:
     if memory is None:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") - PROCESS
     if need > memory:
+        many = "--seeds, " * (seeds > 1)
         raise ConfigError(
-            f"env.num_envs, env.frames, ppo.rollout_steps, ppo.minibatches and network sizes need "
-            f"about {shown(need)}; {device.device_kind} has {shown(memory)}"
+            f"{many}env.num_envs, env.frames, ppo.rollout_steps, ppo.minibatches and network sizes "
+            f"need about {shown(need)}; {device.device_kind} has {shown(memory)}"
         )

@@ -5,6 +5,7 @@ processes run the same loop.
 """
 
 import contextlib
+import functools
 import math
 import shutil
 import time
@@ -22,7 +23,7 @@ from kslc_jax.training.checkpoint import BEST_METRIC
 from kslc_jax.training.checkpoint_process import CheckpointStore, LocalStorage
 from kslc_jax.training.logs import MetricsFile, Progress
 from kslc_jax.training.recovery import NumericsCheck
-from kslc_jax.training.run_folder import locked, open_folder, writing
+from kslc_jax.training.run_folder import locked, note_resume, open_folder, writing
 from kslc_jax.training.wandb_run import WandbRun
 
 Record = dict[str, float]
@@ -86,12 +87,16 @@ class Recorder(NullRecorder):
         progress: Progress,
         save_policy: Callable[[Policy, Path], None] = policy.save_policy,
         wandb: WandbRun | None = None,
+        begin: Callable[[int], None] = lambda step: None,
     ):
+        """`begin` is called with the train step after which a loop begins."""
+        self._begin = begin
         self._config, self._run_dir, self._store = config, run_dir, store
         self._progress, self._save_policy, self._wandb = progress, save_policy, wandb
 
     @contextlib.contextmanager
     def at(self, step: int) -> Generator[None]:
+        self._begin(step)
         with writing(self._run_dir):
             self._file = MetricsFile(self._run_dir, step, self._progress.warn)
         self._begun = time.monotonic() - self._file.seconds_before
@@ -185,7 +190,8 @@ def opened(
             store = stack.enter_context(contextlib.closing(storage.open(run_dir, config)))
         online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if wandb else None
         run = stack.enter_context(online) if online else None
-        yield Recorder(config, run_dir, store, progress, storage.save_policy, run)
+        begin = functools.partial(note_resume, run_dir, config, facts)
+        yield Recorder(config, run_dir, store, progress, storage.save_policy, run, begin)
 
 
 def snapshot_due(config: Config, step: int) -> bool:

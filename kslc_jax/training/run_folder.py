@@ -22,7 +22,6 @@ from kslc_jax.checkpoint_format import (
     has_checkpoints,
     identity,
     keep_robot,
-    whole_checkpoints,
 )
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
@@ -114,45 +113,56 @@ def locked(run_dir: Path) -> Generator[None]:
 
 
 def open_folder(run_dir: Path, config: Config, resume: bool, facts: dict[str, Any]) -> None:
-    """Writes config and versions into a run folder, after a check of its content.
+    """Checks the content of a run folder. For a new training it also writes config and versions.
 
     Args:
       run_dir: the folder, which must exist.
       config: config of the training.
-      resume: True: the training in the folder continues.
+      resume: True: the training in the folder continues. `note_resume` writes the files, once its
+        state is restored: a resume that fails changes nothing.
       facts: `circumstances`, and the policy that the training starts from, if any.
 
     Raises:
-      RunError: there is no training to resume, or a new training would overwrite one. A training
-        that ended before it saved its first train step may be overwritten.
+      RunError: there is no training to resume, or see `require_free`.
       ConfigError: the training in the folder has another config.
     """
     if resume:
         _require_same(run_dir, config)
-    elif has_checkpoints(run_dir) or rows_written(run_dir) > 1:
+        return
+    require_free(run_dir)
+    with writing(run_dir):
+        keep_robot(config, run_dir, anew=True)
+        _write(run_dir / files.VERSIONS, facts)
+        _write(run_dir / files.CONFIG, config_lib.to_dict(config))
+
+
+def note_resume(run_dir: Path, config: Config, facts: dict[str, Any], step: int) -> None:
+    """Writes the config of a resumed training, and what changed since it last ran.
+
+    `step` is the number of train steps done. A second call, and one for a new training, changes
+    nothing.
+    """
+    with writing(run_dir):
+        keep_robot(config, run_dir)
+        if news := _news(run_dir, facts):
+            kept = _stored_versions(run_dir)
+            news = {"train_step": step, **news}
+            _write(run_dir / files.VERSIONS, kept | {RESUMED: [*kept.get(RESUMED, []), news]})
+        _write(run_dir / files.CONFIG, config_lib.to_dict(config))
+
+
+def require_free(run_dir: Path) -> None:
+    """RunError if a new training in this folder would overwrite another one, or the seeds of one.
+
+    A training that ended before it saved its first train step may be overwritten.
+    """
+    seeds = [files.seed_folder(run_dir, seed) for seed in files.seeds_in(run_dir)]
+    if any(has_checkpoints(folder) or rows_written(folder) > 1 for folder in (run_dir, *seeds)):
+        held = f"a training of {len(seeds)} seeds" if seeds else "a training"
         raise RunError(
-            f"{run_dir} already holds a training: go on with --resume --run-dir "
+            f"{run_dir} already holds {held}: go on with --resume --run-dir "
             f"{shlex.quote(str(run_dir))}, or name another --run-dir"
         )
-    done = last_step(run_dir)
-    with writing(run_dir):
-        keep_robot(config, run_dir, anew=not resume)
-        if not resume:
-            _write(run_dir / files.VERSIONS, facts)
-        elif done < config.num_updates and (news := _news(run_dir, facts)):
-            kept = _stored_versions(run_dir)
-            news = {"train_step": done, **news}
-            _write(run_dir / files.VERSIONS, kept | {RESUMED: [*kept.get(RESUMED, []), news]})
-        if done <= config.num_updates:
-            _write(run_dir / files.CONFIG, config_lib.to_dict(config))
-
-
-def last_step(run_dir: Path) -> int:
-    """Train step of the latest checkpoint; 0 if there is none."""
-    folder = run_dir / files.CHECKPOINTS
-    return (
-        max((int(p.name) for p in whole_checkpoints(folder)), default=0) if folder.is_dir() else 0
-    )
 
 
 # ---------------------------------------------------------------------------------- circumstances

@@ -28,6 +28,7 @@ from kslc_jax.checkpoint_format import CheckpointError, has_checkpoints
 from kslc_jax.config import Config, RunConfig
 from kslc_jax.train_step import Metrics, TrainState
 from kslc_jax.training import recorder as recorder_lib
+from kslc_jax.training import run_folder
 from kslc_jax.training.checkpoint_process import LocalStorage
 from kslc_jax.training.logs import Progress, SeedsProgress
 from kslc_jax.training.recorder import NullRecorder, Record, Recorder
@@ -113,6 +114,8 @@ def opened(count: int) -> Callable[..., contextlib.AbstractContextManager["Seeds
         wandb: bool,
     ) -> Generator[SeedsRecorder]:
         with contextlib.ExitStack() as stack:
+            if not resume:
+                run_folder.require_free(run_dir)
             seeds = []
             for number in range(config.seed, config.seed + count):
                 its = dataclasses.replace(config, seed=number)
