@@ -194,6 +194,7 @@ def draw(args: Args, policy) -> None:
 
     if args.video is not None and args.video.suffix.lower() in films.FILMS:
         films.film_writer()
+    render.require_gl()  # before the simulation, which takes a minute
     trace, start, dt = record(args, policy)
     robot = render.shown_robot(policy, args.terrain)
     tried = [args.schedule] if args.schedule else [f"{speed:g} m/s" for speed in args.speeds]

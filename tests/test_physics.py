@@ -1,6 +1,9 @@
 """Both engines: torque limits, parity, batch independence, divergence."""
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -401,24 +404,30 @@ def test_every_range_is_filled_independently():
     assert np.abs(apart - np.eye(len(apart))).max() < 0.1
 
 
-@pytest.mark.parametrize("engine", QUICK_FIRST)
-def test_a_program_that_enables_x64_can_step(engine, monkeypatch):
-    """A script may need float64 for other things. The state keeps its dtypes, so it can be scanned
-    over. Traced only: that is where a wrong dtype shows, and compiling takes long."""
-    config = PhysicsConfig(engine=engine)
-    monkeypatch.setattr(physics, "_mjx_model", physics._mjx_model.__wrapped__)  # caches nothing
-    jax.clear_caches()  # JAX would reuse traces of other tests, which are without x64
+def step_with_x64(engine: str) -> None:
+    """Traces control steps in a program that enables x64."""
     jax.config.update("jax_enable_x64", True)
-    try:
-        state = standing(config)
-        assert {str(x.dtype) for x in jax.tree.leaves(state)} == {"float32", "float64"}
+    config = PhysicsConfig(engine=engine)
+    state = standing(config)
+    assert {str(x.dtype) for x in jax.tree.leaves(state)} == {"float32", "float64"}
 
-        def step(s, _):
-            return physics.step(config, s, s.qpos[7:], randomize.nominal(XBOT), GROUND), None
+    def step(s, _):
+        return physics.step(config, s, s.qpos[7:], randomize.nominal(XBOT), GROUND), None
 
-        after = jax.eval_shape(lambda s: jax.lax.scan(step, s, None, 2)[0], state)
-        assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, state)
-        if engine == "mujoco":  # quickly compiled
-            step(state, None)
-    finally:
-        jax.config.update("jax_enable_x64", False)
+    after = jax.eval_shape(lambda s: jax.lax.scan(step, s, None, 2)[0], state)
+    assert jax.tree.map(lambda x: x.dtype, after) == jax.tree.map(lambda x: x.dtype, state)
+    if engine == "mujoco":  # quickly compiled
+        step(state, None)
+
+
+@pytest.mark.parametrize("engine", QUICK_FIRST)
+def test_a_program_that_enables_x64_can_step(engine):
+    """A script may need float64 for other things. The state keeps its dtypes, so it can be scanned
+    over. Traced only: that is where a wrong dtype shows, and compiling takes long.
+
+    In a process of its own: JAX would reuse traces of other tests, which are without x64, and
+    without its caches the tests that follow would compile all programs again."""
+    code = f"import test_physics; test_physics.step_with_x64({engine!r})"
+    command, here = [sys.executable, "-c", code], Path(__file__).parent
+    done = subprocess.run(command, cwd=here, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

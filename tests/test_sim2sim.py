@@ -87,7 +87,7 @@ def test_perturbations_reach_the_robot():
     ("condition", "kg"), [("nominal", 0), ("payload=5", 5), ("payload=-5", -5)]
 )
 def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
-    random_policy, condition, kg
+    random_policy, frozen, condition, kg
 ):
     """The trace's mass is that of the model which the engine steps: 53.036 kg and the payload."""
     setting = dataclasses.replace(

@@ -17,22 +17,23 @@ from kslc_jax.config import HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import gait_metrics, trials
 
 DT = 0.01
+C_MUJOCO = PhysicsConfig(engine="mujoco")
 
 
 @pytest.fixture(scope="module")
 def still():
     """A policy that asks for the default pose whatever it sees."""
-    config = preset("debug")
+    config = dataclasses.replace(preset("debug"), physics=C_MUJOCO)
     params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
     return policy_lib.Policy(config, params, curriculum.init(config), 0)
 
 
-@pytest.mark.parametrize("physics", [PhysicsConfig(engine="mujoco"), HighFidelity()])
+@pytest.mark.parametrize("physics", [C_MUJOCO, HighFidelity()])
 def test_servos_alone_stand_a_second_and_then_fall(still, physics):
     """Bare servos fall after about two seconds at either fidelity; what fell stays fallen."""
     setting = trials.Setting(physics, seconds=5.0)
-    trace = trials.join(list(trials.run(still, setting, np.zeros((3, 3)))))
-    assert trace.alive.shape == (500, 3) and trace.qpos.shape == (500, 3, 23)
+    trace = trials.join(list(trials.run(still, setting, np.zeros((4, 3)))))
+    assert trace.alive.shape == (500, 4) and trace.qpos.shape == (500, 4, 23)
     assert trace.alive[:80].all() and not trace.alive[-1].any()
     assert not np.any(np.diff(trace.alive.astype(int), axis=0) > 0)
     weight = (trace.contact[30:80]).mean()
@@ -41,7 +42,7 @@ def test_servos_alone_stand_a_second_and_then_fall(still, physics):
 
 def test_commands_hold(still):
     """The commanded velocity reaches the frames and stays; a yaw rate keeps the heading ahead."""
-    setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=1.0)
+    setting = trials.Setting(C_MUJOCO, seconds=1.0)
     config = trials.trial_config(still.config, setting, 2)
     assert config.command.resample_seconds >= 10.0 and config.env.noise_level == 0.0
     assert config.randomize.push_seconds == 0.0
@@ -189,6 +190,7 @@ def test_arms_momentum_is_theirs_alone(xbot):
 
 
 def test_sweep_and_table(still):
+    """Of four robots, so that it needs no other program than the trials of the servos."""
     args = evaluate.Args("still", speeds=(0.0, 1.0), seeds=2, seconds=3.0)
     rows = evaluate.sweep(args, still)
     assert [r["command"] for r in rows] == [0.0, 1.0]

@@ -55,6 +55,12 @@ def _renderer(model: mujoco.MjModel, height: int, width: int, **more: int) -> mu
         ) from error
 
 
+def require_gl() -> None:
+    """RenderError if this machine cannot draw off screen."""
+    with _renderer(mujoco.MjModel.from_xml_string("<mujoco/>"), height=16, width=16):
+        pass
+
+
 def shown_robot(policy: "Policy", terrain: TerrainConfig | None = None) -> Robot:
     """The policy's robot at high fidelity; the training model has shapes that should be hidden.
 
