@@ -92,7 +92,7 @@ def trained(shipped, monkeypatch):
         progress.close()
         if outcome["raises"]:
             raise outcome["raises"]
-        run_dir.mkdir(parents=True)
+        run_dir.mkdir(parents=True, exist_ok=True)
         rows = [
             dict.fromkeys(records.COLUMNS, 0.0) | {"env_steps": steps, "curriculum/v_max": v}
             for steps, v in ((128, 0.5), (2900, 1.0))
