@@ -483,6 +483,7 @@ class TestAround:
 
         monkeypatch.setattr(Store, "save", noisy_save)
         monkeypatch.setattr(Store, "wait", noisy_wait)
+        training.saved_at = range(1, 9)
         assert training(lambda state: state) == 0
         said = "done: 8 train" if last == 8 else f"stopped by {name} at train step {last}"
         assert said in capsys.readouterr().out and sent

@@ -209,8 +209,8 @@ def test_robots_start_unlike_each_other(made):
 
 
 def test_slow_commands_at_the_top_count_as_if_they_were_faster():
-    """Commands of 0.5 and 3.0 m/s give speeds of 0.4 and 3.3 m/s: deviation -0.1 + 0.3, scale 2.0 +
-    3.0. The third command has not settled, and the fourth is not at the top."""
+    """Commands of 0.5 and 4.0 m/s give speeds of 0.4 and 4.3 m/s: deviation -0.1 + 0.3, scale 3.0 +
+    4.0. The third command has not settled, and the fourth is not at the top."""
     no = jnp.zeros(4, bool)
     out = env.Outcome(
         reward=jnp.zeros(4),
@@ -221,13 +221,13 @@ def test_slow_commands_at_the_top_count_as_if_they_were_faster():
         settled=jnp.array([True, True, False, True]),
         fast=no,
         top=jnp.array([True, True, True, False]),
-        commanded=jnp.array([0.5, 3.0, 3.0, 1.0]),
-        speed=jnp.array([0.4, 3.3, 0.0, 0.0]),
+        commanded=jnp.array([0.5, 4.0, 4.0, 1.0]),
+        speed=jnp.array([0.4, 4.3, 0.0, 0.0]),
         episode_steps=jnp.zeros(4, int),
         speeding=no,
     )
     progress = train_step._progress(preset("laptop"), out)
     assert float(progress.top_deviation) == pytest.approx(0.2)
-    assert float(progress.top_scale) == pytest.approx(5.0)
+    assert float(progress.top_scale) == pytest.approx(7.0)
     assert float(progress.top_falls) == 2.0
     assert float(progress.top_minutes) == pytest.approx(3 * 0.01 / 60)

@@ -21,7 +21,7 @@ import pytest
 import kslc_jax.viewer
 from kslc_jax import config, curriculum, files, networks, play, robot
 from kslc_jax import policy as policy_lib
-from kslc_jax.config import ConfigError, PhysicsConfig, preset
+from kslc_jax.config import PhysicsConfig, preset
 from kslc_jax.evaluation import schedules, trials
 from kslc_jax.viewer import films, following, session
 
@@ -602,15 +602,14 @@ def test_what_is_shown_ends_with_the_fall(fall, steps):
     assert films.shown(np.arange(150) < fall, start=100) == range(*steps)
 
 
-def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", SimpleNamespace())
-    monkeypatch.setattr(kslc_jax.viewer, "render", SimpleNamespace(), raising=False)
+def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(play, "record", None)
     (tmp_path / "file").touch()
-    for name, out in (("gait_strip", "out.png"), ("video", "out.mp4")):
-        args = play.Args(Path("x"), **{name: tmp_path / "file" / out})
-        with pytest.raises(ConfigError, match="cannot write"):
-            play.draw(args, None)
+    for name, out in (("gait-strip", "out.png"), ("video", "out.mp4")):
+        assert play.main(["xbot_l_run", f"--{name}", str(tmp_path / "file" / out)]) == 2
+        assert "cannot write" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "kslc_jax.viewer.render", SimpleNamespace())
+    monkeypatch.setattr(kslc_jax.viewer, "render", SimpleNamespace(), raising=False)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ImportError, match=r"pip install 'kslc_jax\[video\]'"):
         play.draw(play.Args(Path("x"), video=tmp_path / "out.mp4"), None)
