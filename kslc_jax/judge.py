@@ -28,9 +28,10 @@ import tyro
 
 from kslc_jax import cli, evaluate, files
 from kslc_jax.config import ConfigError, require_seed
-from kslc_jax.evaluation import tables
-from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars, scaled
-from kslc_jax.evaluation.perturbations import ALL, changes, settings, similar
+from kslc_jax.evaluation import bars as bars_lib
+from kslc_jax.evaluation import perturbations, tables
+from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
+from kslc_jax.evaluation.perturbations import ALL, changes, settings
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
 """Commanded speeds [m/s]. No bar uses the last one; it is only reported."""
@@ -41,6 +42,9 @@ HEADINGS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 SCHEDULE = "random"
 
 DRAKE_SECONDS = 20.0
+
+SPEED = "curriculum.v_limit"
+"""Field whose `similar.factors` entry is the factor on speeds."""
 
 
 @dataclass(frozen=True)
@@ -57,15 +61,20 @@ class Size:
     perturbed_speeds: tuple[float, ...]
     perturbed_seeds: int
     perturbed_seconds: float
+    top: float = TOP  # fastest speed that Drake tries
 
-    def for_robot(self, length: float, mass: float) -> "Size":
-        """The size for a robot of this length and mass by XBot-L's: other speeds, perturbations."""
-        scale = math.sqrt(length)
+    def for_robot(self, factors: dict[str, float]) -> "Size":
+        """The size for a robot with these `similar.factors`: other speeds, other perturbations."""
+
+        def own(speeds: tuple[float, ...]) -> tuple[float, ...]:
+            return tuple(bars_lib.scaled(speed, factors[SPEED]) for speed in speeds)
+
         return dataclasses.replace(
             self,
-            speeds=tuple(scaled(speed, scale) for speed in self.speeds),
-            perturbations=tuple(similar(name, length, mass) for name in self.perturbations),
-            perturbed_speeds=tuple(scaled(speed, scale) for speed in self.perturbed_speeds),
+            speeds=own(self.speeds),
+            perturbations=tuple(perturbations.scaled(c, factors) for c in self.perturbations),
+            perturbed_speeds=own(self.perturbed_speeds),
+            top=own((self.top,))[0],
         )
 
 
@@ -115,43 +124,30 @@ class Args:
         return dataclasses.replace(QUICK if self.quick else FULL, **given)
 
 
-def size_for(args: Args, policy) -> Size:
-    """Size of the measurement for the policy's robot."""
-    from kslc_jax import physics
-
-    robot = physics.robot_for(policy.config.physics)
-    return args.size.for_robot(robot.length_ratio, robot.mass_ratio)
-
-
-def judged(results: "Results", policy) -> list[Bar]:
-    """The bars for the policy's robot, applied to the results of `measure`."""
-    from kslc_jax import physics
-
-    robot = physics.robot_for(policy.config.physics)
-    return bars(results, math.sqrt(robot.length_ratio), bool(robot.is_arm.any()))
-
-
 Results = dict[str, Any]
 Progress = Callable[[str, float], None]
 
 
 def measure(
-    args: Args, policy, progress: Progress, keep: Callable[[Results], None] = lambda found: None
+    size: Size,
+    args: Args,
+    policy,
+    progress: Progress,
+    keep: Callable[[Results], None] = lambda found: None,
 ) -> Results:
     """Measures everything that `bars` reads. Calls `keep` with the results after each part."""
     found: Results = {}
     for name, part in PARTS.items():
         if name != "drake" or args.drake:
-            found[name] = part(args, policy, progress)
+            found[name] = part(size, args, policy, progress)
             keep(found)
     return found
 
 
-def _speeds(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
+def _speeds(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     from kslc_jax.evaluation import trials
     from kslc_jax.evaluation.measure import measure as measured
 
-    size = size_for(args, policy)
     plain = trials.Setting(trials.engine(policy, "high"), seconds=size.seconds)
 
     def told(share: float) -> None:
@@ -160,10 +156,12 @@ def _speeds(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     return measured(policy, plain, size.speeds, size.seeds, args.seed, told)
 
 
-def _schedules(args: Args, policy, progress: Progress) -> dict[str, list[dict[str, Any]]]:
+def _schedules(
+    size: Size, args: Args, policy, progress: Progress
+) -> dict[str, list[dict[str, Any]]]:
     from kslc_jax.evaluation import scheduled, schedules, trials
 
-    size, found = size_for(args, policy), {}
+    found = {}
     schedule = schedules.named(SCHEDULE, policy.config, float(policy.curriculum.v_max))
     for i, heading in enumerate(size.headings):
 
@@ -179,14 +177,16 @@ def _schedules(args: Args, policy, progress: Progress) -> dict[str, list[dict[st
     return found
 
 
-def _perturbed(args: Args, policy, progress: Progress) -> dict[str, list[dict[str, float]]]:
+def _perturbed(
+    size: Size, args: Args, policy, progress: Progress
+) -> dict[str, list[dict[str, float]]]:
     from kslc_jax.evaluation import gait_metrics, trials
     from kslc_jax.evaluation.measure import measure as measured
 
     def speed(trace, command: float, robot, dt: float) -> dict[str, float]:
         return gait_metrics.speed(trace, command, dt)
 
-    size, found = size_for(args, policy), {}
+    found = {}
     plain = trials.Setting(trials.engine(policy, "high"), seconds=size.perturbed_seconds)
     for i, condition in enumerate(size.perturbations):
 
@@ -200,16 +200,15 @@ def _perturbed(args: Args, policy, progress: Progress) -> dict[str, list[dict[st
     return found
 
 
-def _drake(args: Args, policy, progress: Progress) -> list[dict[str, float]]:
+def _drake(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
     from kslc_jax import sim2sim
     from kslc_jax.evaluation import trials
     from kslc_jax.evaluation.measure import measure as measured
 
-    size = size_for(args, policy)
     setting = trials.Setting(
         trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
     )
-    speeds = [own for v, own in zip(args.size.speeds, size.speeds, strict=True) if v <= TOP]
+    speeds = [speed for speed in size.speeds if speed <= size.top]
     return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
 
 
@@ -241,14 +240,17 @@ def _report(args: Args) -> None:
     """Measures the policy, prints the table, writes the numbers."""
     from rich.progress import Progress
 
-    from kslc_jax import sim2sim
+    from kslc_jax import physics, sim2sim, similar
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     sim2sim.simulator("drake" if args.drake else "mujoco")
     policy = load_policy(args.policy)
+    robot = physics.robot_for(policy.config.physics)
+    factors = similar.factors(robot)
+    size = args.size.for_robot(factors)
     about: Results = {"policy": policy_name(args.policy), "step": policy.step, "quick": args.quick}
-    about |= {"seed": args.seed, "size": dataclasses.asdict(size_for(args, policy))}
+    about |= {"seed": args.seed, "size": dataclasses.asdict(size)}
 
     def keep(found: Results) -> None:
         if args.json is not None:
@@ -267,8 +269,8 @@ def _report(args: Args) -> None:
             bar.start_task(tasks[name])
             bar.update(tasks[name], completed=share)
 
-        found = measure(args, policy, progress, keep_part)
-    against = judged(found, policy)
+        found = measure(size, args, policy, progress, keep_part)
+    against = bars(found, factors[SPEED], arms=bool(robot.is_arm.any()))
     screen.print(table(against, f"{args.policy}, train step {policy.step}"))
     keep(found | {"bars": [dataclasses.asdict(one) for one in against]})
 

@@ -64,25 +64,25 @@ ALL = (
 )
 """The conditions of `--perturb all`."""
 
-SCALES: dict[str, Callable[[float, float], float]] = {
-    "payload": lambda length, mass: mass,
-    "com": lambda length, mass: length,
-    "push": lambda length, mass: math.sqrt(length),
-    "hands": lambda length, mass: mass,
-    "sole": lambda length, mass: length,
-    "joints": lambda length, mass: mass * length,
+SCALED_AS = {
+    "payload": "randomize.base_mass",
+    "com": "randomize.base_com",
+    "push": "randomize.push_velocity",
+    "hands": "randomize.hand_mass",
+    "sole": "randomize.sole",
+    "joints": "randomize.joint_friction",
 }
-"""Name -> (length and mass of a robot by XBot-L's -> factor on the value), by dynamic similarity.
-Values of other names are the same for all robots."""
+"""Name -> the config field that depends on a robot's size in the same way. Values of other names
+are the same for all robots."""
 
 ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
 """Names of the changes that belong in `trials.Setting.randomize`."""
 
 
-def similar(condition: str, length: float, mass: float) -> str:
-    """The condition with its value for a robot of this length and mass by XBot-L's."""
+def scaled(condition: str, factors: dict[str, float]) -> str:
+    """The condition with its value for a robot of another size; `factors`: `similar.factors`."""
     name, _, value = condition.partition("=")
-    factor = SCALES[name](length, mass) if name in SCALES else 1.0
+    factor = factors[SCALED_AS[name]] if name in SCALED_AS else 1.0
     return condition if factor == 1.0 else f"{name}={float(value) * factor:.2g}"
 
 
