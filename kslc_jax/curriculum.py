@@ -109,9 +109,10 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
 
     The gate opens if all of these are good enough: tracking under all and under fast commands, the
     length of episodes, agreement of the feet with the clock (from `gait_from` on), and, under
-    commands at the top, the mean speed and the number of falls. A mean over all commands would hide
-    the last two. At least `min_updates` updates lie between two changes. After a change the
-    averages of fast commands and the sums at the top start at zero again.
+    commands at the top, the mean speed (from `top_error_from` on) and the number of falls. A mean
+    over all commands would hide the last two. At least `min_updates` updates lie between two
+    changes. After a change the averages of fast commands and the sums at the top start at zero
+    again.
     """
     state = _averaged(config, state, progress)
     v_max = jnp.minimum(state.v_max + config.v_step, config.v_limit)
@@ -123,7 +124,7 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
         & (state.fast_tracking >= config.fast_threshold)
         & (state.episode_steps >= config.min_episode_steps)
         & ((state.gait >= config.gait_threshold) | (state.v_max < config.gait_from))
-        & (top_error(state) <= config.top_error)
+        & ((top_error(state) <= config.top_error) | (state.v_max < config.top_error_from))
         & (top_falls(state) <= config.top_falls)
         & (state.updates >= config.min_updates)
         & ((v_max > state.v_max) | (cycle < state.cycle_time))

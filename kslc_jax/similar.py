@@ -70,6 +70,7 @@ def factors(robot: Robot) -> dict[str, float]:
         "curriculum.v_step": time,
         "curriculum.v_limit": time,
         "curriculum.cycle_min": time,
+        "curriculum.top_error_from": time,
         "curriculum.top_error_floor": time,
         "physics.terrain.rough": length,
         "physics.terrain.stairs": length,

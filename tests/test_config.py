@@ -218,6 +218,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "curriculum.gait_threshold": 0.75,
         "curriculum.gait_from": 0.75,
         "curriculum.top_error": 0.05,
+        "curriculum.top_error_from": 1.75,
         "curriculum.top_error_floor": 3.0,
         "curriculum.top_falls": 1.0,
         "curriculum.cycle_factor": 0.925,
@@ -549,6 +550,7 @@ LATER_FIELDS = {
     "rewards.exact_full": 2.5,
     "curriculum.gait_threshold": -1.0,
     "curriculum.gait_from": 0.0,
+    "curriculum.top_error_from": 0.0,
     "randomize.noise": (1.0, 1.0),
     "run.snapshots": 24,
 }

@@ -90,14 +90,26 @@ def test_a_shuffle_does_not_open_the_gate():
     assert float(curriculum.update(DIRECT, state(**READY), progress(gait=-0.3)).v_max) == 1.0
 
 
-def test_the_first_range_may_grow_before_the_feet_follow_the_clock():
-    """Below `gait_from` the gate does not look at the gait."""
-    strict = dataclasses.replace(DIRECT, gait_threshold=0.65, gait_from=0.75)
-    first = curriculum.update(strict, state(**READY), progress(gait=0.5))
+@pytest.mark.parametrize(
+    ("condition", "poor", "good"),
+    [
+        ({"gait_threshold": 0.65, "gait_from": 0.75}, {"gait": 0.5}, {"gait": 0.66}),
+        (
+            {"top_error": 0.05, "top_error_from": 0.75},
+            {"top_deviation": -2.1},
+            {"top_deviation": -1.9},
+        ),
+    ],
+    ids=["gait", "top error"],
+)
+def test_the_first_ranges_grow_without_some_conditions(condition, poor, good):
+    """Below `gait_from` and `top_error_from` the gate does not look at the gait and the error."""
+    strict = dataclasses.replace(DIRECT, **condition)
+    first = curriculum.update(strict, state(**READY), progress(**poor))
     assert float(first.v_max) == 1.0
-    for gait, v_max in ((0.5, 1.0), (0.66, 1.5)):
+    for seen, v_max in ((poor, 1.0), (good, 1.5)):
         ready = state(**READY).replace(v_max=first.v_max)
-        assert float(curriculum.update(strict, ready, progress(gait=gait)).v_max) == v_max
+        assert float(curriculum.update(strict, ready, progress(**seen)).v_max) == v_max
 
 
 STRICT = dataclasses.replace(DIRECT, top_error=0.05, top_falls=1.0)

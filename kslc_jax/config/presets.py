@@ -77,6 +77,7 @@ _LAPTOP = _override(
         "gait_threshold": 0.75,
         "gait_from": 0.75,
         "top_error": 0.05,
+        "top_error_from": 1.75,
         "top_error_floor": 3.0,
         "top_falls": 1.0,
         "cycle_factor": 0.925,

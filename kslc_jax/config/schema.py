@@ -522,6 +522,8 @@ class CurriculumConfig:
     top_error: float = 1e9
     """Largest relative error of the mean speed under commands in the top `v_step` of the range. The
     range does not grow before the robot can run its top speed. 1e9: no condition."""
+    top_error_from: float = 0.0
+    """The gate looks at `top_error` while v_max [m/s] >= top_error_from."""
     top_error_floor: float = 2.0
     """For `top_error`, the error is divided by this speed [m/s] if the command is slower. Slow
     walking then needs less relative accuracy."""
