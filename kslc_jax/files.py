@@ -125,8 +125,13 @@ def write_atomically(path: Path, text: str) -> None:
 
 @contextlib.contextmanager
 def saving(path: Path) -> Generator[Path]:
-    """`replacing` for a result that a user has asked for: ConfigError if it cannot be written."""
+    """`replacing` for a result that a user has asked for; makes its folder, too.
+
+    Raises:
+      ConfigError: the result cannot be written.
+    """
     try:
+        _make_folder(path)
         with replacing(path) as part:
             yield part
     except OSError as error:
@@ -146,12 +151,17 @@ def require_writable(path: Path | None) -> None:
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
         if not _is_device(path):
+            _make_folder(path)
             target = _target(path)
-            target.parent.mkdir(parents=True, exist_ok=True)
             _part(target).touch()
             _part(target).unlink()
     except OSError as error:
         raise ConfigError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _make_folder(path: Path) -> None:
+    """Makes the folder of a file; of a link, the folder of the file that it points to."""
+    _target(path).parent.mkdir(parents=True, exist_ok=True)
 
 
 def require_suffix(path: Path | None, kinds: Sequence[str]) -> None:
