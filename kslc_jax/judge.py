@@ -22,16 +22,19 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from kslc_jax import cli, evaluate, files
 from kslc_jax.config import ConfigError, require_seed
 from kslc_jax.evaluation import bars as bars_lib
-from kslc_jax.evaluation import perturbations, tables
+from kslc_jax.evaluation import tables
 from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
+
+if TYPE_CHECKING:
+    from kslc_jax.robot import Robot
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
 """Commanded speeds [m/s]. No bar uses the last one; it is only reported."""
@@ -63,8 +66,12 @@ class Size:
     perturbed_seconds: float
     top: float = TOP  # fastest speed that Drake tries
 
-    def for_robot(self, factors: dict[str, float]) -> "Size":
-        """The size for a robot with these `similar.factors`: other speeds, other perturbations."""
+    def for_robot(self, robot: "Robot") -> "Size":
+        """The size for another robot: other speeds, other perturbations."""
+        from kslc_jax import similar
+        from kslc_jax.evaluation import variation
+
+        factors = similar.factors(robot)
 
         def own(speeds: tuple[float, ...]) -> tuple[float, ...]:
             return tuple(bars_lib.scaled(speed, factors[SPEED]) for speed in speeds)
@@ -72,7 +79,7 @@ class Size:
         return dataclasses.replace(
             self,
             speeds=own(self.speeds),
-            perturbations=tuple(perturbations.scaled(c, factors) for c in self.perturbations),
+            perturbations=variation.for_robot(self.perturbations, robot),
             perturbed_speeds=own(self.perturbed_speeds),
             top=own((self.top,))[0],
         )
@@ -241,14 +248,15 @@ def _report(args: Args) -> None:
     from rich.progress import Progress
 
     from kslc_jax import physics, sim2sim, similar
+    from kslc_jax.evaluation import trials
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     sim2sim.simulator("drake" if args.drake else "mujoco")
     policy = load_policy(args.policy)
-    robot = physics.robot_for(policy.config.physics)
-    factors = similar.factors(robot)
-    size = args.size.for_robot(factors)
+    robot = physics.robot_for(trials.engine(policy, "high"))
+    sim2sim.require("drake" if args.drake else "mujoco", robot)
+    size, factors = args.size.for_robot(robot), similar.factors(robot)
     about: Results = {"policy": policy_name(args.policy), "step": policy.step, "quick": args.quick}
     about |= {"seed": args.seed, "size": dataclasses.asdict(size)}
 

@@ -166,6 +166,7 @@ def record(args: Args, policy):
     import jax
     import numpy as np
 
+    from kslc_jax import physics
     from kslc_jax.evaluation import trials
 
     schedule = plan(args, policy)
@@ -180,6 +181,9 @@ def record(args: Args, policy):
         simulate=sim2sim.simulator(args.engine),
         schedule=schedule,
     )
+    robot = physics.robot_for(engine)
+    sim2sim.require(args.engine, robot)
+    trials.require(setting, robot)
     trace = trials.join(list(trials.run(policy, setting, velocities, args.seed)))
     start = round(settle / engine.control_dt)
     stop = start + round(args.shown_seconds / engine.control_dt)

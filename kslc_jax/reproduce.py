@@ -148,6 +148,7 @@ def repeat(args: Args) -> list[Row]:
         seconds=old["seconds"],
         fidelity=old["fidelity"],
         noise=old.get("noise", False),
+        ground=old.get("ground"),
         seed=old.get("seed", 0),
     )
     screen = console()

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import flax.struct
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from kslc_jax.commands import Command, speed_share
 from kslc_jax.config import RewardConfig
@@ -169,8 +170,8 @@ def feet_contact_number(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -
 
 
 def feet_air_time(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sum of the air times [s] of the feet that just landed, at most 0.5 s each."""
-    return jnp.sum(jnp.clip(x.gait.landing, 0.0, 0.5))
+    """Sum of the air times [s] of the feet that just landed, at most `longest_air_time` each."""
+    return jnp.sum(jnp.clip(x.gait.landing, 0.0, cfg.longest_air_time))
 
 
 def foot_slip(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
@@ -180,8 +181,9 @@ def foot_slip(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def feet_contact_forces(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Sum of the foot forces [N] above `max_contact_force`, at most 400 N per foot."""
-    return jnp.sum(jnp.clip(x.signals.foot_force - cfg.max_contact_force, 0.0, 400.0))
+    """Sum of the foot forces [N] above `max_contact_force`, at most `contact_force_range` each."""
+    excess = x.signals.foot_force - cfg.max_contact_force
+    return jnp.sum(jnp.clip(excess, 0.0, cfg.contact_force_range))
 
 
 def _spread(cfg: RewardConfig, x: Inputs, points: jax.Array, bounds: tuple[float, float]):
@@ -223,7 +225,7 @@ def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> 
     x [rad] is the size of (roll, yaw) of the left leg plus that of the right leg.
     """
     q = x.signals.joint_pos
-    legs = sum(norm(q[jnp.array(robot.roll_and_yaw(side))]) for side in ("left", "right"))
+    legs = sum(norm(q[np.array(robot.roll_and_yaw(side), int)]) for side in ("left", "right"))
     return jnp.exp(-100.0 * jnp.clip(legs - 0.1, 0.0, 50.0)) - 0.01 * norm(q)
 
 

@@ -56,6 +56,7 @@ from kslc_jax.evaluation.perturbations import (
 if TYPE_CHECKING:
     from kslc_jax.evaluation.trials import Setting
     from kslc_jax.policy import Policy
+    from kslc_jax.robot import Robot
 
 Engine = Literal["mujoco", "drake"]
 
@@ -115,7 +116,7 @@ class Args:
     error of roll and pitch), links=SHARE (largest change of each link's mass), hands=KG at each
     hand, sole=M (largest distance of a sole's sides from the foot's outline), joints=X (each joint
     gets up to X N m more friction and X N m s/rad more damping), heading=RAD at the start; all:
-    sixteen of these."""
+    sixteen of these, with values that fit the robot's size."""
     seed: int = 0
     """Seed of the initial states."""
     json: Path | None = None
@@ -134,17 +135,32 @@ class Args:
         for ground in self.ground:
             terrain(ground)
         for name in self.conditions:
-            made = changes(name)
+            made = changes(name) if name != "all" else {}
             if self.engine == "drake" and (self.punch or not made.keys().isdisjoint(MUJOCO_ONLY)):
                 raise ConfigError("punches, hands, sole, joints and ground need --engine mujoco")
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """All conditions to try, the nominal one first."""
-        every = [c for c in ALL if self.engine == "mujoco" or "variation" not in changes(c)]
-        asked = (c for name in self.perturb for c in (every if name == "all" else (name,)))
         turned = (f"heading={yaw:g}" for yaw in self.heading[1:])
-        return tuple(dict.fromkeys(("nominal", *turned, *self.ground, *asked)))
+        return tuple(dict.fromkeys(("nominal", *turned, *self.ground, *self.perturb)))
+
+
+def named(args: Args, robot: "Robot") -> tuple[str, ...]:
+    """`args.perturb`, with the conditions that fit the robot and the engine in place of "all"."""
+    from kslc_jax.evaluation import variation
+
+    possible = [c for c in ALL if args.engine == "mujoco" or "variation" not in changes(c)]
+    every = variation.for_robot(possible, robot)
+    return tuple(c for name in args.perturb for c in (every if name == "all" else (name,)))
+
+
+def require(engine: Engine, robot: "Robot") -> None:
+    """ConfigError if the engine cannot take over the robot."""
+    if engine == "drake":
+        from kslc_jax.evaluation import drake
+
+        drake.require_plain(robot)
 
 
 def simulator(engine: Engine):
@@ -258,16 +274,18 @@ def main(argv: list[str] | None = None) -> int:
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, writes the numbers."""
     simulator(args.engine)  # fails now if the engine's package is missing
-    from kslc_jax import physics, randomize
+    from kslc_jax import physics
     from kslc_jax.evaluation import schedules, trials
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
     engine = trials.engine(policy, "high")
-    for condition in args.conditions:  # an impossible robot or schedule fails before any trial
-        tried = setting(args, engine, condition)
-        randomize.require_trunk(tried.randomize, physics.robot_for(engine))
+    robot = physics.robot_for(engine)
+    args = dataclasses.replace(args, perturb=named(args, robot))
+    require(args.engine, robot)  # what is impossible fails before any trial
+    for condition in args.conditions:
+        trials.require(setting(args, engine, condition), robot)
     for name in args.schedule:
         schedules.named(name, policy.config, float(policy.curriculum.v_max), args.top)
     screen = tables.console()

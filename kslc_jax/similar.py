@@ -90,6 +90,8 @@ def factors(robot: Robot) -> dict[str, float]:
         "rewards.clearance_target": length,
         "rewards.clearance_width": length,
         "rewards.max_contact_force": mass,
+        "rewards.contact_force_range": mass,
+        "rewards.longest_air_time": time,
         "rewards.feet_distance": robot.feet_apart / xbot.feet_apart,
         "rewards.knee_distance": robot.knees_apart / xbot.knees_apart,
         "rewards.lean_per_speed": 1.0 / time,
@@ -98,6 +100,9 @@ def factors(robot: Robot) -> dict[str, float]:
         "rewards.joint_pos_kernel": math.sqrt(joints),
         "rewards.joint_pos_penalty": math.sqrt(joints),
         "rewards.joint_pos_clip": 1.0 / math.sqrt(joints),
+        "rewards.restless": math.sqrt(joints),  # within stand_still
+        "rewards.weights.stand_still": math.sqrt(joints),
+        "rewards.weights.dof_vel_limits": joints,
         "rewards.weights.feet_air_time": 1.0 / time,
         "rewards.weights.foot_slip": 1.0 / math.sqrt(time),
         "rewards.weights.feet_contact_forces": 1.0 / mass,

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -27,15 +28,17 @@ from kslc_jax import (
     physics,
     policy,
     randomize,
+    records,
     rewards,
     robot,
     signals,
+    sim2sim,
     similar,
     train,
     train_step,
 )
 from kslc_jax.commands import Command
-from kslc_jax.evaluation import gait_metrics, trials
+from kslc_jax.evaluation import gait_metrics, perturbations, trials, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robots import copying, description
 from kslc_jax.robots.description import RobotError
@@ -90,6 +93,7 @@ def test_a_quarter_of_the_height_and_an_eighth_of_the_mass():
     assert c.rewards.base_height_target == pytest.approx(0.2225, rel=1e-2)
     assert c.rewards.weights.torques == pytest.approx(-1e-5 * 32**2, rel=1e-2)
     assert c.rewards.weights.dof_acc == pytest.approx(-3e-7 / 16, rel=1e-2)
+    assert (c.rewards.contact_force_range, c.rewards.longest_air_time) == (50.0, 0.25)
     assert c.rewards.weights.action_smoothness == laptop.rewards.weights.action_smoothness
     assert c.rewards.feet_distance == laptop.rewards.feet_distance  # of the same shape
     paper = similar.scaled(config.preset("paper"), small)
@@ -99,7 +103,10 @@ def test_a_quarter_of_the_height_and_an_eighth_of_the_mass():
 def test_sums_over_joints_scale_with_their_number(biped):
     c, factors = config.preset("laptop"), similar.factors(biped)
     assert biped.count == 9
-    assert factors["rewards.weights.action_smoothness"] == 16 / 9
+    for term in ("action_smoothness", "dof_vel_limits"):
+        assert factors[f"rewards.weights.{term}"] == 16 / 9
+    restless = factors["rewards.restless"] * factors["rewards.weights.stand_still"]
+    assert restless == pytest.approx(16 / 9)
     assert factors["rewards.joint_pos_kernel"] == pytest.approx(4 / 3)
     assert similar.scaled(c, biped).rewards.joint_pos_clip == pytest.approx(0.375)
     assert factors["rewards.knee_distance"] == pytest.approx(0.2 / XBOT.knees_apart)
@@ -400,6 +407,59 @@ def test_starting_from_another_robots_policy_names_the_numbers(mine, untrained, 
     with pytest.warns(UserWarning, match="trained with another robot: kp of .* 60 -> 66"):
         init, _ = train_step.make(setup)
         starting.from_policy(tmp_path / "policy", setup, init, LocalStorage(), None)
+
+
+def test_legs_may_have_neither_roll_nor_yaw(biped, setup):
+    """The term of these joints then asks for nothing of them: 1 - 0.01 |q|."""
+    roles = biped.anatomy.roles
+    pitch = {name: joint for name, joint in roles.items() if not name.endswith(("roll", "yaw"))}
+    assert len(pitch) < len(roles)
+    anatomy = dataclasses.replace(biped.anatomy, roles=pitch)
+    flat = dataclasses.replace(biped, anatomy=anatomy)
+    joints = jnp.full(biped.count, 0.2)
+    x = SimpleNamespace(signals=SimpleNamespace(joint_pos=joints))
+    value = rewards.default_joint_pos(setup.rewards, flat, setup.control_dt, x)
+    assert float(value) == pytest.approx(1.0 - 0.01 * 0.2 * 3.0, abs=1e-6)
+
+
+def test_a_robot_is_tried_under_what_it_can_have():
+    """The biped has no arms, and its feet are no boxes of known names."""
+    physics_config = config.HighFidelity(robot=BIPED)
+    high = physics.robot_for(physics_config)
+    plain = trials.Setting(physics_config)
+
+    def setting(condition):
+        fields = perturbations.settings(perturbations.changes(condition), plain.randomize)
+        return dataclasses.replace(plain, **fields)
+
+    possible = variation.for_robot(perturbations.ALL, high)
+    assert [c.split("=")[0] for c in perturbations.ALL if c.split("=")[0] in ("hands", "sole")]
+    assert len(possible) == 14 and not {"hands", "sole"} & {c.split("=")[0] for c in possible}
+    assert "payload=5" not in possible  # a payload of its size
+    for condition in possible:
+        trials.require(setting(condition), high)
+    for condition in ("hands=0.5", "sole=0.01"):
+        with pytest.raises(config.ConfigError, match="leave it out"):
+            trials.require(setting(condition), high)
+    held = dataclasses.replace(plain.randomize, held_arms=1.0)
+    with pytest.raises(config.ConfigError, match="has no arms"):
+        trials.require(dataclasses.replace(plain, randomize=held), high)
+
+
+def test_drake_refuses_a_robot_that_it_cannot_take_over():
+    drake = pytest.importorskip("kslc_jax.evaluation.drake")
+    drake.require_plain(robot.load("high"))
+    with pytest.raises(config.ConfigError, match="--engine mujoco"):
+        drake.require_plain(robot.load("high", name=BIPED))
+
+
+@pytest.mark.slow(reason="compiles a trial for each of fifteen conditions: minutes")
+def test_the_biped_is_tried_in_full_mujoco(untrained, tmp_path, capsys):
+    policy.save_policy(untrained, tmp_path / "policy")
+    out = tmp_path / "out.json"
+    short = ["--perturb", "all", "--speeds", "0.3", "--seeds", "1", "--seconds", "1"]
+    assert sim2sim.main([str(tmp_path / "policy"), *short, "--json", str(out)]) == 0
+    assert len(records.read_conditions(out)) == 15
 
 
 def test_a_robot_is_chosen_by_its_own_option(capsys):

@@ -546,6 +546,8 @@ LATER_FIELDS = {
     "rewards.weights.tracking_mean_vel": 0.0,
     "rewards.clearance_mid_swing": False,
     "rewards.restless": 0.0,
+    "rewards.contact_force_range": 400.0,
+    "rewards.longest_air_time": 0.5,
     "rewards.exact_from": 0.5,
     "rewards.exact_full": 2.5,
     "curriculum.gait_threshold": -1.0,

@@ -348,6 +348,13 @@ class TestJudging:
         physics_config = dataclasses.replace(policy.config.physics, terrain=ALL)
         config = dataclasses.replace(policy.config, physics=physics_config)
         assert trained.beyond(dataclasses.replace(policy, config=config), rough) == {}
+        growing = dataclasses.replace(
+            physics_config, terrain=dataclasses.replace(ALL, full_from=9.0)
+        )
+        half = dataclasses.replace(policy.config, physics=growing)  # v_max 4.5: half of the size
+        assert trained.beyond(dataclasses.replace(policy, config=half), rough) == {
+            "beyond": ["ground"]
+        }
 
     @pytest.mark.slow(reason="compiles a trial")
     def test_a_trial_records_its_ground(self):

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from kslc_jax import judge, robot, similar
+from kslc_jax import judge, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.evaluation import measure as measuring
 from kslc_jax.evaluation import scheduled
@@ -108,9 +108,9 @@ def test_a_smaller_robot_has_slower_bars_and_one_without_arms_has_none_on_them()
 def test_a_robot_of_another_size_is_tried_at_its_own_speeds():
     """Lengths scale with l, speeds with sqrt(l), masses with m, torques with m l."""
     xbot = robot.load()
-    assert judge.FULL.for_robot(similar.factors(xbot)) == judge.FULL
+    assert judge.FULL.for_robot(xbot) == judge.FULL
     quarter = dataclasses.replace(xbot, length_ratio=0.25, mass_ratio=0.5)
-    small = judge.FULL.for_robot(similar.factors(quarter))
+    small = judge.FULL.for_robot(quarter)
     assert small.top == 2.0
     assert small.speeds == (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25)
     assert small.perturbed_speeds == (0.5, 1.0, 1.5) and small.headings == judge.HEADINGS

@@ -11,6 +11,7 @@ import pytest
 from kslc_jax import curriculum, networks
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import reaction, schedules, trained, trials
+from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.policy import Policy
 
 DT = 0.01
@@ -241,6 +242,9 @@ def test_what_lies_beyond_the_training_is_named(still):
     assert robots(base_mass=(5.0, 5.0)) == [] and robots(base_mass=(8.0, 8.0)) == ["base_mass"]
     assert robots(friction=(0.3, 0.3), ground_friction=0.3) == ["friction"]
     assert robots(push_seconds=4.0, push_velocity=0.5) == ["push"]
+    assert robots(link_mass=(0.9, 1.1)) == [] and robots(link_mass=(0.8, 1.2)) == ["link_mass"]
+    assert reasons(variation=Variation(hands=0.5)) == []
+    assert reasons(variation=Variation(hands=0.6, sole=0.01)) == ["hands", "sole"]
     assert robots(punch=(300.0, 300.0), held_arms=1.0) == ["punch", "arms"]
     assert robots(punch=(100.0, 100.0)) == []
     assert reasons(latency=1, imu_offset=(0.1, 0.0)) == ["latency", "imu"]

@@ -100,16 +100,23 @@ def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
     assert float(fields["body_mass"].sum()) == pytest.approx(trace.mass[0, 0], abs=1e-4)
 
 
+def resolved(**options):
+    """The conditions of the command line, with those of XBot-L in place of "all"."""
+    args = sim2sim.Args("x", **options)
+    args = dataclasses.replace(args, perturb=sim2sim.named(args, robot.load("high")))
+    return args.conditions
+
+
 def test_all_runs_sixteen_perturbations_after_the_nominal_robot():
-    conditions = sim2sim.Args("x", perturb=("all",)).conditions
-    more = sim2sim.Args("x", perturb=("all", "friction=0.2", "payload=5")).conditions
+    conditions = resolved(perturb=("all",))
+    more = resolved(perturb=("all", "friction=0.2", "payload=5"))
     assert more == (*conditions, "friction=0.2")  # payload=5 is one of the sixteen
     assert conditions[0] == "nominal" and len(set(conditions)) == 17
 
 
 def test_drake_runs_what_it_can():
     """Robots whose hands, soles or joints differ need MuJoCo."""
-    conditions = sim2sim.Args("x", engine="drake", perturb=("all",)).conditions
+    conditions = resolved(engine="drake", perturb=("all",))
     assert len(conditions) == 14 and "hands=0.5" not in conditions
     for what in ({"perturb": ("hands=0.5",)}, {"punch": 100.0}):
         with pytest.raises(ConfigError, match="need --engine mujoco"):

@@ -457,6 +457,10 @@ class RewardConfig:
     """c2, the upper bound in Eq. 8 [rad]; c1 is 0."""
     max_contact_force: float = 700.0
     """Foot force [N] above which `feet_contact_forces` counts (HG)."""
+    contact_force_range: float = 400.0
+    """Largest excess [N] over `max_contact_force` that counts, for each foot (HG)."""
+    longest_air_time: float = 0.5
+    """Largest air time [s] that `feet_air_time` counts (HG)."""
     lateral_distance: bool = False
     """True: feet and knee distance are measured across the heading, so that strides do not count.
     False: in the plane (HG)."""

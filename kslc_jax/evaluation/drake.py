@@ -96,9 +96,9 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     `model` is the robot's model or a changed copy. All shapes have the friction of the feet.
 
     Raises:
-      ConfigError: Drake cannot take over the robot's frames or feet, see `_require_plain`.
+      ConfigError: Drake cannot take over the robot, see `require_plain`.
     """
-    _require_plain(robot, model)
+    require_plain(robot)
     builder = DiagramBuilder()
     settings = MultibodyPlantConfig(
         time_step=model.opt.timestep,
@@ -129,8 +129,9 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     )
 
 
-def _require_plain(robot: Robot, model: mujoco.MjModel) -> None:
+def require_plain(robot: Robot) -> None:
     """ConfigError if a body has no joint, a frame is turned or shifted, or a foot is missing."""
+    model = robot.mj_model
     moved = model.body_jntnum[1:] == 0
     turned = ~np.all(np.isclose(model.body_quat[1:], [1.0, 0.0, 0.0, 0.0]), axis=1)
     shifted = np.any(model.jnt_pos != 0.0, axis=1)

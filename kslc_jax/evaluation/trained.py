@@ -12,7 +12,7 @@ from kslc_jax.policy import Policy
 TOLERANCE = 1e-6
 """Numbers that exceed a range by at most this still lie in the range."""
 
-RANGES = ("base_mass", "base_com", "kp", "kd", "motor_strength", "joint_friction")
+RANGES = ("base_mass", "base_com", "kp", "kd", "motor_strength", "joint_friction", "link_mass")
 """Fields of RandomizeConfig whose ranges are compared directly."""
 
 
@@ -34,12 +34,13 @@ def beyond(
     if schedule and _pace(schedule) < shortest - TOLERANCE:
         reasons.append("pace")
     reasons += _robot_reasons(trained.randomize, setting.randomize)
-    reasons += _ground_reasons(trained.physics.terrain, setting.physics.terrain)
+    reasons += _ground_reasons(trained.physics.terrain, v_max, setting.physics.terrain)
     if setting.latency > trained.env.action_delay:
         reasons.append("latency")
     others: dict[str, bool | float] = {"imu": any(setting.imu_offset)}
     for field in dataclasses.fields(Variation):
         others[field.name] = getattr(setting.variation, field.name)
+    others["hands"] = setting.variation.hands > trained.randomize.hand_mass[1] + TOLERANCE
     reasons += [name for name, value in others.items() if value]
     return {"beyond": reasons} if reasons else {}
 
@@ -81,12 +82,14 @@ def _robot_reasons(trained: RandomizeConfig, tried: RandomizeConfig) -> list[str
         for name, (mine, theirs) in spans.items()
         if mine[0] < theirs[0] - TOLERANCE or mine[1] > theirs[1] + TOLERANCE
     ]
-    pushed = tried.push_seconds > 0 and tried.push_velocity > trained.push_velocity
+    largest = trained.push_velocity if trained.push_seconds > 0 else 0.0
+    pushed = tried.push_seconds > 0 and tried.push_velocity > largest
     punched = tried.punch[1] > trained.punch[1]
     held = tried.held_arms > 0 and trained.held_arms == 0
     return reasons + ["push"] * pushed + ["punch"] * punched + ["arms"] * held
 
 
-def _ground_reasons(trained: TerrainConfig, tried: TerrainConfig) -> list[str]:
-    larger = (getattr(tried, kind) > getattr(trained, kind) + TOLERANCE for kind in GROUNDS)
+def _ground_reasons(trained: TerrainConfig, v_max: float, tried: TerrainConfig) -> list[str]:
+    grown = min(1.0, v_max / trained.full_from) if trained.full_from else 1.0
+    larger = (getattr(tried, kind) > grown * getattr(trained, kind) + TOLERANCE for kind in GROUNDS)
     return ["ground"] * any(larger)

@@ -17,6 +17,7 @@ import numpy as np
 from kslc_jax import commands, env, gait, maths, networks, observations, physics, randomize, signals
 from kslc_jax.config import (
     Config,
+    ConfigError,
     Fidelity,
     HighFidelity,
     PhysicsConfig,
@@ -115,6 +116,14 @@ def engine(
     if fidelity == "high":
         return HighFidelity(robot=trained.robot, terrain=terrain)
     return dataclasses.replace(trained, terrain=terrain)
+
+
+def require(setting: Setting, robot: Robot) -> None:
+    """ConfigError if the robot cannot have the setting's conditions."""
+    randomize.require_trunk(setting.randomize, robot)
+    variation.require(setting.variation, robot)
+    if setting.randomize.held_arms and not robot.is_arm.any():
+        raise ConfigError(f"held arms: {robot.name} has no arms")
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:

@@ -1,10 +1,12 @@
-"""Differences of one robot from its description that training does not randomise.
+"""Differences of one robot from its description that training does not have in this form.
 
-These are heavier hands, soles whose contact area changes, and friction and damping of each joint.
+These are heavier hands, soles whose contact area changes all the time, and friction and damping of
+each joint.
 All of them change fields of the mjModel, see `physics.step`.
 """
 
 import functools
+from collections.abc import Sequence
 
 import flax.struct
 import jax
@@ -12,7 +14,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from kslc_jax import similar
 from kslc_jax.config import ConfigError
+from kslc_jax.evaluation import perturbations
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
 
@@ -34,6 +38,34 @@ class Body:
     damping: jax.Array  # [n] N m s/rad, added damping
 
 
+def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
+    """The conditions that the robot can have, with values that fit its size.
+
+    `hands` needs arms; `sole` needs feet that are boxes.
+    """
+    factors, out = similar.factors(robot), []
+    for condition in conditions:
+        wanted = perturbations.changes(condition).get("variation", Variation())
+        lacks_hands = wanted.hands and not len(robot.hand_body_ids)
+        if not lacks_hands and not (wanted.sole and min(_foot_boxes(robot)) < 0):
+            out.append(perturbations.scaled(condition, factors))
+    return tuple(out)
+
+
+def require(variation: Variation, robot: Robot) -> None:
+    """ConfigError if the robot cannot have the variation."""
+    if variation.sole and min(_foot_boxes(robot)) < 0:
+        raise ConfigError(f"sole: the feet of {robot.name} are no boxes; leave it out")
+    if variation.hands and not len(robot.hand_body_ids):
+        raise ConfigError(f"hands: {robot.name} has no arms; leave it out")
+
+
+def _foot_boxes(robot: Robot) -> list[int]:
+    """Geoms of the left and the right foot; -1 where the robot has no geom of the name."""
+    model = robot.mj_model
+    return [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) for foot in FEET]
+
+
 def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:
     """Draws the differences of one robot."""
     key_friction, key_damping = jax.random.split(key)
@@ -47,14 +79,11 @@ def alter(variation: Variation, robot: Robot, body: Body, key: jax.Array, fields
     """Applies the variation to the mjModel fields of `randomize.model_fields`.
 
     Args:
-      variation: sizes of the differences (static under jit); 0 changes nothing.
+      variation: sizes of the differences (static under jit), see `require`; 0 changes nothing.
       robot: the described robot; `sole` needs it at high fidelity.
       body: the differences of its joints.
       key: random key of this control step.
       fields: mjModel fields by name.
-
-    Raises:
-      ConfigError: `sole` is set, and the robot's feet are not boxes of the names in `FEET`.
     """
     model = robot.mj_model
     if variation.hands:
@@ -108,9 +137,7 @@ def _with_hands(robot: Robot, kg: float) -> dict[str, np.ndarray]:
 def _soles(inset: float, robot: Robot, key: jax.Array, fields: Fields) -> Fields:
     """Random foot boxes that lie inside the described ones and are tilted by up to `TILT`."""
     model = robot.mj_model
-    feet = np.array([mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) for foot in FEET])
-    if feet.min() < 0:
-        raise ConfigError(f"sole: the feet of {robot.name} are no single boxes; leave it out")
+    feet = np.array(_foot_boxes(robot))
     key_sides, key_tilt = jax.random.split(key)
     sides = inset * jax.random.uniform(key_sides, (2, 2, 2))  # foot, axis, front or back
     tilt = jax.random.uniform(key_tilt, (2, 2), minval=-TILT, maxval=TILT)
