@@ -1,7 +1,8 @@
 """Whole trainings side by side: ours, Brax's PPO, PureJaxRL's loop, rsl_rl on torch.
 
-All have the same robot, physics settings, networks, batch, minibatches and epochs. They take turns,
-one train step each, several times. There are two tables:
+All have the same robot, physics settings, networks, batch, minibatches and epochs. None has the
+velocity estimator, which Brax and torch lack. They take turns, one train step each, several times.
+There are two tables:
 
 - On the `mjx` engine: ours, Brax's `ppo.train` (brax_ppo.py names the differences), and a loop in
   the form of PureJaxRL (purejaxrl.py). All use the networks of the preset.
@@ -28,9 +29,15 @@ OURS = "kslc_jax"
 Side = Literal["brax", "purejaxrl", "torch"]
 
 
+def comparable(config: Config, **network: Any) -> Config:
+    """The config without the velocity estimator, and with other fields of the networks."""
+    changed = dataclasses.replace(config.network, estimator=(), **network)
+    return dataclasses.replace(config, network=changed)
+
+
 def on_mjx(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seconds:
     """Seconds of each train step on the mjx engine."""
-    config = timing.on_engine(config, "mjx")
+    config = comparable(timing.on_engine(config, "mjx"))
     runs = {OURS: throughput.training(config)}
     if "purejaxrl" in sides:
         runs["purejaxrl"] = throughput.stepping(*purejaxrl.make(config))
@@ -44,10 +51,7 @@ def on_mjx(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seco
 
 def on_c_mujoco(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seconds:
     """Seconds of each train step with C MuJoCo's physics and plain networks."""
-    config = timing.on_engine(config, "mujoco")
-    config = dataclasses.replace(
-        config, network=dataclasses.replace(config.network, symmetric=False)
-    )
+    config = comparable(timing.on_engine(config, "mujoco"), symmetric=False)
     runs = {OURS: throughput.training(config)}
     if "purejaxrl" in sides:
         runs["purejaxrl"] = throughput.stepping(*purejaxrl.make(config))

@@ -4,16 +4,18 @@ It trains until --seconds are over, then stops the training by SIGTERM, which sa
 this command does the same. The whole runs stay in --run-dir and can be resumed there. The copy in
 --out leaves out the environments, which are most of a checkpoint: per seed it has the config, the
 metrics, all snapshots, and of the latest checkpoint the networks, optimiser and curriculum. So
-evaluate, plots and train --start-from work with it; --resume needs the whole run.
+evaluate and plots work with it, and train --resume goes on with new environments.
 
   python -m benchmarks.lent_gpu --seconds 600 --out carried
   python -m benchmarks.lent_gpu --seconds 600 --resume --run-dir runs/lent --out carried
+  python -m benchmarks.lent_gpu --seconds 600 --preset paper --seeds 1 --out carried
 """
 
 import shutil
 import signal
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,12 +24,13 @@ import tyro
 from kslc_jax import files
 from kslc_jax.checkpoint_format import whole_checkpoints
 from kslc_jax.training import stopping
+from kslc_jax.training.checkpoint import ENVIRONMENTS
 
 LEFT_OUT = (files.TENSORBOARD, files.CHECKPOINTS, files.LOCK)
 """Left out of the copy. The records are in the metrics, too, and one checkpoint comes back."""
 
 LIMIT = 16 * 10**6
-"""Largest size [bytes] of one seed's copy."""
+"""Largest size [bytes] of one file of a copy."""
 
 
 @dataclass(frozen=True)
@@ -50,15 +53,15 @@ class Args:
     """Go on with the runs in --run-dir."""
 
 
-def carry(run: Path, out: Path) -> int:
-    """Copies the run of one seed without its environments; returns the size [bytes]."""
+def carry(run: Path, out: Path) -> list[int]:
+    """Copies the run of one seed without its environments; returns the files' sizes [bytes]."""
     shutil.copytree(run, out, ignore=shutil.ignore_patterns(*LEFT_OUT))
     there = run / files.CHECKPOINTS
     if there.is_dir() and (steps := whole_checkpoints(there)):
         latest = max(steps, key=lambda path: int(path.name))
         copy = out / files.CHECKPOINTS / latest.name
-        shutil.copytree(latest, copy, ignore=shutil.ignore_patterns("env"))
-    return sum(path.stat().st_size for path in out.rglob("*") if path.is_file())
+        shutil.copytree(latest, copy, ignore=shutil.ignore_patterns(ENVIRONMENTS))
+    return [path.stat().st_size for path in out.rglob("*") if path.is_file()]
 
 
 def train(args: Args) -> int:
@@ -69,26 +72,32 @@ def train(args: Args) -> int:
     else:
         command += ["--preset", args.preset, "--seeds", str(args.seeds)]
         command += ["--run.snapshots", str(args.snapshots), "--run.checkpoint-minutes", "1"]
-    process = subprocess.Popen(command)
-    with stopping.handling(lambda number, _: process.send_signal(signal.SIGTERM)):
+    process, stopped = subprocess.Popen(command), threading.Event()
+
+    def stop(*_) -> None:
+        if not stopped.is_set():  # a second SIGTERM would break off the save
+            stopped.set()
+            process.send_signal(signal.SIGTERM)
+
+    with stopping.handling(stop):
         try:
             return process.wait(args.seconds)
         except subprocess.TimeoutExpired:
-            process.send_signal(signal.SIGTERM)
+            stop()
             return process.wait()
 
 
 def main(args: Args) -> int:
-    """Trains and copies; returns the exit code of the training, 1 if a copy is too large."""
+    """Trains and copies; returns the exit code of the training, 1 if a file is too large."""
     if args.out.exists():
         print(f"error: {args.out} exists", file=sys.stderr)
         return 2
     code = train(args)
-    for seed in files.seeds_in(args.run_dir):
-        folder = files.seed_folder(args.run_dir, seed)
-        size = carry(folder, args.out / folder.name)
-        print(f"{args.out / folder.name}: {size / 1e6:.1f} MB", flush=True)
-        code = code or int(size > LIMIT)
+    seeds = files.seeds_in(args.run_dir)
+    for folder in [files.seed_folder(args.run_dir, seed) for seed in seeds] or [args.run_dir]:
+        sizes = carry(folder, args.out / folder.name)
+        print(f"{args.out / folder.name}: {sum(sizes) / 1e6:.1f} MB", flush=True)
+        code = code or int(max(sizes, default=0) > LIMIT)
     return code
 
 

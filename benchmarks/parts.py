@@ -45,7 +45,7 @@ def timed(config: Config) -> dict[str, Callable[[], Any]]:
         return train_step.samples_of(config, traj, last_value)
 
     def update(state, traj, samples):
-        return run_update(state, samples, train_step._observer(config, state.env, traj))
+        return run_update(state, samples, train_step.observer(config, state.env, traj))
 
     def update_on_same_windows(state, traj, samples):
         rows = jnp.arange(config.minibatch_size)

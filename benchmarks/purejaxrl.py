@@ -15,8 +15,9 @@ from kslc_jax.config import Config
 from kslc_jax.ppo import Learner, Samples
 from kslc_jax.train_step import Metrics, TrainState
 
-Stored = tuple[Samples, jax.Array, jax.Array]
-"""Samples, and the histories of actor and critic: [B, ...], [B, K, W], [B, Kp, W]."""
+Stored = tuple[Samples, jax.Array, jax.Array, jax.Array | None]
+"""Samples, the histories of actor and critic, and the velocities that the actor read: [B, ...],
+[B, K, W], [B, Kp, W], [B, 3]; None without an estimator."""
 
 
 def make(
@@ -41,14 +42,15 @@ def step(config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     envs, (traj, *seen) = jax.lax.scan(one, start, keys)
     last_value = networks.value(config, params, envs.privileged_history)
     samples = train_step.samples_of(config, traj, last_value)
-    advantage = ppo._normalise(samples.advantage, samples.valid)
+    advantage = ppo.normalised(samples.advantage, samples.valid)
     history, privileged = (x.reshape(-1, *x.shape[2:]) for x in seen)
-    stored = (samples.replace(advantage=advantage), history, privileged)
+    velocity = jax.tree.map(lambda x: x.reshape(-1, networks.ESTIMATED), traj.velocity)
+    stored = (samples.replace(advantage=advantage), history, privileged, velocity)
     learner, losses = _update(config, state, stored, key_update)
-    progress = train_step._progress(config, traj.outcome)
+    progress = train_step.progress_of(config, traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
     new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
-    return new, train_step._metrics(config, new, traj.outcome, progress, losses)
+    return new, train_step.metrics_of(config, new, traj.outcome, progress, losses)
 
 
 def _update(
@@ -58,12 +60,9 @@ def _update(
     constants = train_step.rollout_constants(config, state)
 
     def minibatch(learner: Learner, batch: Stored) -> tuple[Learner, Metrics]:
-        samples, history, privileged = batch
-
-        def apply(params, _):
-            dist = networks.policy(config, params, history)
-            return dist, networks.value(config, params, privileged)
-
+        samples, history, privileged, velocity = batch
+        apply = train_step.policy_at(config, lambda _: (history, privileged), velocity)
+        samples = samples.replace(index=jnp.arange(config.minibatch_size))
         return ppo.gradient_step(config.ppo, apply, constants, learner, samples)
 
     def epoch(learner: Learner, key: jax.Array) -> tuple[Learner, Metrics]:

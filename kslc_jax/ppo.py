@@ -214,7 +214,7 @@ def update(
     """
     ceiling = jnp.minimum(CEILING_GROWTH * learner.rate_ceiling, config.learning_rate_bounds[1])
     learner = learner.replace(rate_ceiling=ceiling)
-    samples = samples.replace(advantage=_normalise(samples.advantage, samples.valid))
+    samples = samples.replace(advantage=normalised(samples.advantage, samples.valid))
     size = samples.index.shape[0]
 
     def minibatch(learner: Learner, rows: jax.Array) -> tuple[Learner, dict[str, jax.Array]]:
@@ -241,7 +241,7 @@ def averaged(config: PPOConfig, average: Params, newest: Params) -> Params:
     return jax.tree.map(lambda a, b: a + gain * (b - a), average, newest)
 
 
-def _normalise(advantage: jax.Array, valid: jax.Array) -> jax.Array:
+def normalised(advantage: jax.Array, valid: jax.Array) -> jax.Array:
     """Scales to zero mean and unit deviation over the valid samples of the whole batch (HG)."""
     mean = jnp.mean(advantage, where=valid)
     std = jnp.std(advantage, where=valid)

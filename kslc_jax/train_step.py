@@ -110,14 +110,14 @@ def step(
     envs, traj = collect(config, params, start, state.curriculum, key_roll)
     last_value = networks.value(config, params, envs.privileged_history)
     samples = samples_of(config, traj, last_value)
-    apply = _observer(config, start, traj, shard_index)
+    apply = observer(config, start, traj, shard_index)
     learner, losses = ppo.update(
         config.ppo, apply, rollout_constants(config, state), state.learner, samples, key_update
     )
-    progress = _progress(config, traj.outcome)
+    progress = progress_of(config, traj.outcome)
     curriculum = curriculum_lib.update(config.curriculum, state.curriculum, progress)
     new = TrainState(learner, envs, curriculum, state.key, state.step + 1)
-    return new, _metrics(config, new, traj.outcome, progress, losses)
+    return new, metrics_of(config, new, traj.outcome, progress, losses)
 
 
 def rollout_constants(config: Config, state: TrainState) -> RolloutConstants:
@@ -158,7 +158,7 @@ def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Sampl
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), samples)
 
 
-def _observer(
+def observer(
     config: Config, start: EnvState, traj: Trajectory, shard_index: ShardIndex = lambda index: index
 ) -> ppo.PolicyAtIndex:
     """Function that evaluates the networks at observations of `traj`, given by index t * N + n.
@@ -199,7 +199,7 @@ def policy_at(
     return apply
 
 
-def _progress(config: Config, out: Outcome) -> Progress:
+def progress_of(config: Config, out: Outcome) -> Progress:
     """Statistics of the rollout for the curriculum. Broken steps do not count."""
     done = out.terminated | out.truncated
 
@@ -230,7 +230,7 @@ def _progress(config: Config, out: Outcome) -> Progress:
     )
 
 
-def _metrics(
+def metrics_of(
     config: Config, state: TrainState, out: Outcome, progress: Progress, losses: Metrics
 ) -> Metrics:
     """Scalars of one train step.

@@ -101,6 +101,37 @@ def test_ratios_are_of_each_turn():
     assert rows["kslc_jax"]["times_slower"] == 1.0
 
 
+@pytest.mark.parametrize("estimator", [(16,), ()])
+def test_purejaxrls_loop_is_of_todays_train_step(debug, estimator):
+    """Its states and metrics have the shapes and names of ours."""
+    network = dataclasses.replace(debug.network, estimator=estimator)
+    config = dataclasses.replace(debug, network=network)
+    state = jax.eval_shape(train_step.make(config)[0])
+    ours = jax.eval_shape(lambda s: train_step.step(config, s), state)
+    assert jax.eval_shape(lambda s: purejaxrl.step(config, s), state) == ours
+
+
+def test_brax_gets_our_networks(debug):
+    """With the config of the comparison: the same means, deviations and values."""
+    pytest.importorskip("brax", reason="an extra, needed by one benchmark only")
+    from benchmarks import brax_ppo, comparison
+
+    config = comparison.comparable(debug)
+    made = brax_ppo._network_factory(config)()
+    policy, value = (
+        part.init(jax.random.key(1)) for part in (made.policy_network, made.value_network)
+    )
+    robot = physics.robot_for(config.physics)
+    widths = {
+        "state": config.env.frames * observations.actor_width(robot),
+        "privileged_state": config.env.privileged_frames * observations.critic_width(robot),
+    }
+    obs = {name: jnp.ones((3, width)) for name, width in widths.items()}
+    mean, std = made.policy_network.apply(None, policy, obs)
+    assert mean.shape == std.shape == (3, robot.count)
+    assert made.value_network.apply(None, value, obs).shape == (3,)
+
+
 @pytest.mark.slow(reason="compiles a second train step")
 def test_purejaxrls_loop_learns_the_same(debug):
     """Stored and shuffled observations give the same parameters as windows gathered from frames."""
@@ -333,7 +364,7 @@ def test_lent_gpu_stops_and_carries_without_environments(tmp_path, monkeypatch, 
     sleeper.write_text("")  # a training that ends by itself
     args = dataclasses.replace(args, out=tmp_path / "again", seconds=600.0)
     assert lent_gpu.main(args) == 0
-    monkeypatch.setattr(lent_gpu, "LIMIT", 3000)
+    monkeypatch.setattr(lent_gpu, "LIMIT", 1000)  # of a file
     assert lent_gpu.main(dataclasses.replace(args, out=tmp_path / "large")) == 1
 
 

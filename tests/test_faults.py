@@ -804,6 +804,22 @@ class TestDamage:
         step, (warning,) = restored(tmp_path)
         assert step == 1 and "damaged" in warning
 
+    def test_a_run_that_was_carried_without_environments(self, saved, like, tmp_path):
+        """Everything else is as it was saved, and every robot begins a new episode."""
+        saved(tmp_path, 1, 2)
+        said = []
+        with contextlib.closing(Store(tmp_path)) as store:
+            whole = store.restore(like, said.append)
+        for step in ("1", "2"):
+            shutil.rmtree(tmp_path / "checkpoints" / step / "env")
+        with contextlib.closing(Store(tmp_path)) as store:
+            state = store.restore(like, said.append)
+        (warning,) = said
+        assert "checkpoint 2 has no environments, all robots begin new episodes" in warning
+        assert np.isnan(state.env.physics.qvel).all()  # the sign for a new episode
+        same = [jax.tree.leaves(s.replace(env=None, key=None)) for s in (whole, state)]
+        assert all(np.array_equal(a, b) for a, b in zip(*same, strict=True))
+
     def test_policy_with_flipped_bits(self, saved, restored, tmp_path):
         saved(tmp_path, 1)
         flip_bits(tmp_path / "checkpoints" / "1" / "params" / "ocdbt.process_0" / "d")

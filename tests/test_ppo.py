@@ -237,7 +237,7 @@ def test_each_epoch_shuffles_anew_and_takes_every_sample_once(monkeypatch):
 
 
 def test_normalised_over_the_valid_samples():
-    got = ppo._normalise(jnp.array([1.0, 3.0, 1e6]), jnp.array([True, True, False]))
+    got = ppo.normalised(jnp.array([1.0, 3.0, 1e6]), jnp.array([True, True, False]))
     np.testing.assert_allclose(got[:2], [-1.0, 1.0], rtol=1e-5)
 
 

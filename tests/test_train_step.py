@@ -226,7 +226,7 @@ def test_slow_commands_at_the_top_count_as_if_they_were_faster():
         episode_steps=jnp.zeros(4, int),
         speeding=no,
     )
-    progress = train_step._progress(preset("laptop"), out)
+    progress = train_step.progress_of(preset("laptop"), out)
     assert float(progress.top_deviation) == pytest.approx(0.2)
     assert float(progress.top_scale) == pytest.approx(7.0)
     assert float(progress.top_falls) == 2.0

@@ -6,9 +6,11 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
-from kslc_jax import files, ppo
+from kslc_jax import files, ppo, rollout
 from kslc_jax.checkpoint_format import (
     CheckpointError,
     abstract,
@@ -29,6 +31,9 @@ from kslc_jax.train_step import TrainState
 BEST_METRIC = "score"
 """The metric that selects the best checkpoint."""
 
+ENVIRONMENTS = "env"
+"""The item with the environments, which is most of a checkpoint."""
+
 
 def _split(state: TrainState) -> dict[str, Any]:
     return {
@@ -42,7 +47,7 @@ def _split(state: TrainState) -> dict[str, Any]:
             "key": state.key,
             "step": state.step,
         },
-        "env": state.env,
+        ENVIRONMENTS: state.env,
     }
 
 
@@ -55,7 +60,7 @@ def _join(parts: dict[str, Any], like: TrainState) -> TrainState:
         learning_rate=core["learning_rate"],
         rate_ceiling=core["rate_ceiling"],
     )
-    return TrainState(learner, parts["env"], core["curriculum"], core["key"], core["step"])
+    return TrainState(learner, parts[ENVIRONMENTS], core["curriculum"], core["key"], core["step"])
 
 
 class Store:
@@ -129,24 +134,23 @@ class Store:
 
         Args:
           like: gives the shapes and types: arrays, or their abstract shapes.
-          warn: called for each damaged checkpoint, and if the robot has changed since the save.
+          warn: called for each damaged checkpoint, and for each reason of `_restore`.
 
         Raises:
           CheckpointError: there is no readable checkpoint.
         """
         steps, bad = self.steps(), {}
+        carried = not any((self.folder / f"{step}" / ENVIRONMENTS).is_dir() for step in steps)
         for step in reversed(steps):
             try:
-                state, changed = self._restore(step, like)
+                state, reasons = self._restore(step, like, carried)
             except Exception as error:  # damaged metadata can lead orbax anywhere
                 bad[step] = first_line(error)
                 continue
             self._put_aside(bad, step, warn)
-            if changed:
-                warn(
-                    f"the robot has changed since checkpoint {step}: {changed}; from here on "
-                    "numbers differ from those of an uninterrupted training"
-                )
+            for reason in reasons:
+                different = "numbers differ from those of an uninterrupted training"
+                warn(f"{reason}; from here on {different}")
             return state
         if not steps:
             raise CheckpointError(f"no checkpoint in {self.folder}")
@@ -163,9 +167,15 @@ class Store:
         if bad:
             self._manager.reload()
 
-    def _restore(self, step: int, like: TrainState) -> tuple[TrainState, str]:
-        """(state, description of the robot's changes since the save; empty if there are none)."""
-        parts = _split(like)
+    def _restore(self, step: int, like: TrainState, carried: bool) -> tuple[TrainState, list[str]]:
+        """(state, reasons why the training goes on differently from an uninterrupted one).
+
+        `carried`: the run was copied without environments. All robots then begin new episodes.
+        """
+        parts, reasons = _split(like), []
+        if carried:
+            del parts[ENVIRONMENTS]
+            reasons.append(f"checkpoint {step} has no environments, all robots begin new episodes")
         items = {name: ocp.args.StandardRestore(abstract(part)) for name, part in parts.items()}
         only_meta = ocp.args.Composite(meta=ocp.args.JsonRestore())
         folder = self.folder / str(step)
@@ -174,8 +184,13 @@ class Store:
         sums = meta.get("checksums", {})
         for name in items:
             require_checksum(sums, name, checksum(restored[name]))
-        changed = changed_robot(meta, folder)
-        return _join({name: restored[name] for name in items}, like), changed
+        if changed := changed_robot(meta, folder):
+            reasons.append(f"the robot has changed since checkpoint {step}: {changed}")
+        found = {name: restored[name] for name in items}
+        if carried:
+            blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like.env)
+            found[ENVIRONMENTS] = rollout.broken_state(blank)
+        return _join(found, like), reasons
 
     def close(self) -> None:
         """Waits for the last save and closes the folder."""
