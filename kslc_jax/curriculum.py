@@ -3,6 +3,8 @@
 Its state is part of the train state. Commands "at the top" are those of `is_top`.
 """
 
+import functools
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -104,13 +106,27 @@ def remaining_share(config: CurriculumConfig, state: Curriculum) -> jax.Array:
     return (config.v_limit - state.v_max) / way if way > 0.0 else jnp.ones(())
 
 
+def conditions(config: CurriculumConfig, state: Curriculum) -> dict[str, jax.Array]:
+    """What must be good enough before the range grows: name -> [] bool.
+
+    The last two are about commands at the top; a mean over all commands would hide them.
+    """
+    return {
+        "tracking under all commands": state.tracking >= config.threshold,
+        "tracking under fast commands": state.fast_tracking >= config.fast_threshold,
+        "length of the episodes": state.episode_steps >= config.min_episode_steps,
+        "feet that follow the clock": (state.gait >= config.gait_threshold)
+        | (state.v_max < config.gait_from),
+        "mean speed under the fastest commands": (top_error(state) <= config.top_error)
+        | (state.v_max < config.top_error_from),
+        "falls under the fastest commands": top_falls(state) <= config.top_falls,
+    }
+
+
 def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> Curriculum:
     """Adds `progress` to the averages. If the gate opens, widens the range and shortens the cycle.
 
-    The gate opens if all of these are good enough: tracking under all and under fast commands, the
-    length of episodes, agreement of the feet with the clock (from `gait_from` on), and, under
-    commands at the top, the mean speed (from `top_error_from` on) and the number of falls. A mean
-    over all commands would hide the last two. At least `min_updates` updates lie between two
+    The gate opens if all `conditions` are met. At least `min_updates` updates lie between two
     changes. After a change the averages of fast commands and the sums at the top start at zero
     again.
     """
@@ -120,12 +136,7 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
     v_max = v_max if config.velocity else state.v_max
     cycle = cycle if config.cycle else state.cycle_time
     gate = (
-        (state.tracking >= config.threshold)
-        & (state.fast_tracking >= config.fast_threshold)
-        & (state.episode_steps >= config.min_episode_steps)
-        & ((state.gait >= config.gait_threshold) | (state.v_max < config.gait_from))
-        & ((top_error(state) <= config.top_error) | (state.v_max < config.top_error_from))
-        & (top_falls(state) <= config.top_falls)
+        functools.reduce(jnp.logical_and, conditions(config, state).values())
         & (state.updates >= config.min_updates)
         & ((v_max > state.v_max) | (cycle < state.cycle_time))
     )

@@ -10,6 +10,7 @@ import pytest
 from kslc_jax import curriculum
 from kslc_jax.config import preset
 from kslc_jax.curriculum import Curriculum, Progress
+from kslc_jax.training import logs
 
 PAPER = preset("paper")
 CONFIG = PAPER.curriculum
@@ -110,6 +111,32 @@ def test_the_first_ranges_grow_without_some_conditions(condition, poor, good):
     for seen, v_max in ((poor, 1.0), (good, 1.5)):
         ready = state(**READY).replace(v_max=first.v_max)
         assert float(curriculum.update(strict, ready, progress(**seen)).v_max) == v_max
+
+
+def test_a_training_says_why_its_range_did_not_grow_to_the_end():
+    """Two seeds: one has reached the limit, the other falls and is too slow at its top."""
+    config = preset("laptop", ())
+    limit = config.curriculum.v_limit
+    good = dict(tracking=0.9, fast_tracking=0.8, episode_steps=2000.0, gait=0.8, top_scale=10.0)
+    states = (
+        state(v_max=limit),
+        state(v_max=4.0, **good).replace(
+            top_deviation=jnp.float32(-0.6),
+            top_falls=jnp.float32(2.0),
+            top_minutes=jnp.float32(1.0),
+        ),
+    )
+    both = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    (line,) = logs.range_reached(dataclasses.replace(config, seed=3), both)
+    assert line == (
+        "seed 4: the commands grew to 4 of 4.5 m/s; not good enough at the end: "
+        "mean speed under the fastest commands, falls under the fastest commands"
+    )
+    assert logs.range_reached(config, states[0]) == []
+    assert logs.range_reached(config, states[1])[0].startswith(
+        "the commands grew to 4 of 4.5 m/s; not"
+    )
+    assert logs.range_reached(preset("baseline"), states[1]) == []
 
 
 STRICT = dataclasses.replace(DIRECT, top_error=0.05, top_falls=1.0)

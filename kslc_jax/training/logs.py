@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 from rich import box
 from rich.console import Console
@@ -17,8 +18,9 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2
 from tensorboardX.summary import Summary
 
-from kslc_jax import files
+from kslc_jax import curriculum, files
 from kslc_jax.config import Config
+from kslc_jax.curriculum import Curriculum
 
 PLAIN_SECONDS = 10.0
 """Time [s] between two progress lines if the output is no terminal."""
@@ -243,3 +245,18 @@ class SeedsProgress(Progress):
             if term != name and getattr(weights, term) != 0:
                 table.add_row(term, *(f"{column[name]:.4g}" for column in columns))
         return table
+
+
+def range_reached(config: Config, state: Curriculum) -> list[str]:
+    """A line for each seed whose range of commands did not grow to its limit, with the reasons."""
+    lines, limits = [], config.curriculum
+    for i in range(np.size(state.v_max)):
+        one = jax.tree.map(lambda x, i=i: np.atleast_1d(x)[i], state)
+        if limits.velocity and one.v_max < limits.v_limit:
+            unmet = [name for name, met in curriculum.conditions(limits, one).items() if not met]
+            whose = f"seed {config.seed + i}: " * (np.size(state.v_max) > 1)
+            lines.append(
+                f"{whose}the commands grew to {one.v_max:g} of {limits.v_limit:g} m/s; "
+                f"not good enough at the end: {', '.join(unmet) or 'nothing'}"
+            )
+    return lines

@@ -29,7 +29,7 @@ from kslc_jax.training import devices, memory, profiling, recovery, run_folder, 
 from kslc_jax.training import recorder as recorder_lib
 from kslc_jax.training import seeds as seeds_lib
 from kslc_jax.training.checkpoint_process import ChildProcessStorage, LocalStorage
-from kslc_jax.training.logs import Progress
+from kslc_jax.training.logs import Progress, range_reached
 from kslc_jax.training.recorder import NullRecorder, Record
 from kslc_jax.training.recovery import NonFiniteState, NumbersError
 from kslc_jax.training.stopping import stop_requests
@@ -238,11 +238,12 @@ def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
             devices.on_first(lambda: job.recorder.finish(last, record))
     if not stop.requested:
         numerics.require_some_good()
-    _farewell(job, _done(state), stop.requested, numerics.finite)
+    _farewell(job, state, stop.requested, numerics.finite)
     return state
 
 
-def _farewell(job: _Job, step: int, stopped_by: str | None, whole: bool) -> None:
+def _farewell(job: _Job, state: TrainState, stopped_by: str | None, whole: bool) -> None:
+    step = _done(state)
     saved = "saved" if whole else "not saved: the numbers are not finite"
     if stopped_by and step < job.config.num_updates:
         job.progress.say(
@@ -251,6 +252,8 @@ def _farewell(job: _Job, step: int, stopped_by: str | None, whole: bool) -> None
         )
     else:
         job.progress.say(f"done: {job.config.num_updates} train steps, {saved} in {job.run_dir}")
+        for line in range_reached(job.config, jax.device_get(state.curriculum)):
+            job.progress.say(line)
 
 
 def _nothing_to_do(job: _Job, step: int) -> str:
