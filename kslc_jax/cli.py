@@ -109,16 +109,17 @@ def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
       needs_output: True: the command fails if its output cannot be written, as on a full disk.
         Output without a reader (a closed pipe or terminal) is no failure.
     """
-    runtime.prepare(gl=False)
-    runtime.quiet()
     streams.open_missing()
-    with streams.lasting() as output:
+    with runtime.own_numerics(), streams.lasting() as output:
+        runtime.prepare(gl=False)
+        runtime.quiet()
         try:
             code = do() or 0
         except UserError as error:
             print(f"error: {error}", file=sys.stderr)
             code = error.exit_code
     if needs_output and code == 0 and output.failure:
-        print(f"error: cannot write the output: {output.failure.strerror}", file=sys.stderr)
+        with contextlib.suppress(OSError):  # both outputs may lie on the full disk
+            print(f"error: cannot write the output: {output.failure.strerror}", file=sys.stderr)
         return 2
     return code

@@ -107,6 +107,22 @@ def fix_numerics() -> list[str]:
     return [f"{name}={value}" for name, value in found.items()]
 
 
+@contextlib.contextmanager
+def own_numerics() -> Generator[None]:
+    """At its end the options of `NUMERICS` in JAX are what they were, if JAX was imported before.
+
+    A command may run in a notebook whose user has chosen, say, 64-bit numbers.
+    """
+    options = getattr(sys.modules.get("jax"), "config", None)
+    before = {name: getattr(options, name) for name in NUMERICS if hasattr(options, name)}
+    try:
+        yield
+    finally:
+        if options is not None:
+            for name, value in before.items():
+                options.update(name, value)
+
+
 def _means(text: str, value: str | bool | int | None) -> bool:
     """True if JAX reads `text` in the environment as `value`."""
     if isinstance(value, bool):

@@ -274,14 +274,11 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
         return error.exit_code
     except UserError:
         raise
-    except KeyboardInterrupt:
-        print("interrupted before the state was saved", file=sys.stderr)
-        return devices.leave(130)
-    except Exception:
+    except BaseException as error:
         if not devices.several():
             raise
         traceback.print_exc()
-        return devices.leave(1)
+        return devices.leave(130 if isinstance(error, KeyboardInterrupt) else 1)
     return 0
 
 

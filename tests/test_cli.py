@@ -152,6 +152,10 @@ def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
         said = capsys.readouterr().err
         assert "JAX_ENABLE_X64=True" in said and "MATMUL_PRECISION=bfloat16" in said
         assert {name: getattr(jax.config, name) for name in runtime.NUMERICS} == before
+        jax.config.update("jax_enable_x64", True)
+        inside = []
+        assert cli.run(lambda: inside.append(jax.config.jax_enable_x64)) == 0
+        assert inside == [False] and jax.config.jax_enable_x64  # the user's option comes back
     finally:
         for name, value in before.items():
             jax.config.update(name, value)

@@ -97,6 +97,14 @@ def test_output_onto_a_full_disk(needs_output, code, monkeypatch, capsys):
     assert said == "error: cannot write the output: No space left on device\n" * needs_output
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has it")
+def test_both_outputs_onto_a_full_disk():
+    code = "import sys; from kslc_jax import cli; sys.exit(cli.run(lambda: print('table')))"
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run([sys.executable, "-c", code], stdout=full, stderr=full)
+    assert done.returncode == 2
+
+
 def test_characters_that_the_terminal_lacks_are_escaped(monkeypatch):
     reader, writer = os.pipe()
     with io.TextIOWrapper(io.FileIO(writer, "w"), encoding="ascii") as narrow:
