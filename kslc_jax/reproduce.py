@@ -21,7 +21,7 @@ import tyro
 from rich.progress import Progress
 from rich.table import Table
 
-from kslc_jax import cli, evaluate, files, runtime
+from kslc_jax import cli, evaluate, files, runtime, similar
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.evaluation.tables import console
@@ -75,6 +75,12 @@ def stored(folder: Path, name: str) -> dict[str, Any]:
         return json.loads((folder / name).read_text())
     except (OSError, ValueError) as error:
         raise ConfigError(f"{folder} holds no readable {name}: nothing to compare with") from error
+
+
+def of_an_older_recipe(config: Config) -> bool:
+    """True if the default preset differs from the config, in more than seed and run options."""
+    today = similar.preset("laptop", config.physics.robot)
+    return dataclasses.replace(today, seed=config.seed, run=config.run) != config
 
 
 def compare_rows(old: list[dict[str, float]], new: list[dict[str, float]]) -> list[Row]:
@@ -158,6 +164,8 @@ def repeat(args: Args) -> list[Row]:
     rows = compare_rows(old["rows"], new)
     screen.print(report(rows, f"{args.policy}: evaluation"))
     if args.train:
+        if of_an_older_recipe(policy.config):
+            print(f"{args.policy} is of an older recipe than `make train`'s; its own is trained")
         milestones = stored(folder, files.MILESTONES)
         found = retrain(args, policy.config, LATER * max(milestones.values()))
         trained = compare_milestones(milestones, found)

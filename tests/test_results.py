@@ -1,14 +1,16 @@
 """The tables of docs/results.md and docs/lab_notebook.md agree with the stored data."""
 
+import dataclasses
 import itertools
 import json
 from pathlib import Path
 
 import pytest
 
-from kslc_jax import compare, records
+from kslc_jax import compare, records, reproduce
+from kslc_jax.config import preset
 from kslc_jax.evaluation import tables
-from kslc_jax.policy import POLICIES
+from kslc_jax.policy import POLICIES, load_policy
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = ("results.md", "lab_notebook.md")
@@ -26,6 +28,14 @@ FORMS = {
     "cost of transport": ("cost_of_transport", "{:.2f}"),
 }
 """Column headings of the documents, with metric and format. Command 0 has no cost of transport."""
+
+
+@pytest.mark.parametrize("name", sorted(p.parent.name for p in POLICIES.glob("*/CARD.md")), ids=str)
+def test_a_card_says_if_its_policy_is_of_an_older_recipe(name):
+    """When the preset changes, this test fails until the card says so, or a new policy ships."""
+    config, card = load_policy(name).config, (POLICIES / name / "CARD.md").read_text()
+    assert reproduce.of_an_older_recipe(config) == ("of an older recipe" in card)
+    assert not reproduce.of_an_older_recipe(dataclasses.replace(preset("laptop"), seed=3))
 
 
 def table(section: str) -> list[list[str]]:
