@@ -1,11 +1,11 @@
 """Compare a policy with all bars: python -m kslc_jax.judge POLICY [--quick] [--json out.json]
 
 A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fidelity: at each
-commanded speed, under random changes of the command from four starting headings, and with each
-perturbation of sim2sim. A robot of another size than XBot-L gets other speeds and perturbations, by
-dynamic similarity. Prints one table: each bar, its required value, the worst measured value, and
-the condition of that value. The exit code is 0 even if the policy misses a bar. docs/sim2sim.md
-describes the measurements.
+commanded speed, under random changes of the command from four starting headings (16 robots whose
+masses, motors and friction differ), and with each perturbation of sim2sim. A robot of another size
+than XBot-L gets other speeds and perturbations, by dynamic similarity. Prints one table: each bar,
+its required value, the worst measured value, and the condition of that value. The exit code is 0
+even if the policy misses a bar. docs/sim2sim.md describes the measurements.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from kslc_jax import cli, evaluate, files
-from kslc_jax.config import ConfigError, require_seed
+from kslc_jax.config import ConfigError, RandomizeConfig, require_seed
 from kslc_jax.evaluation import bars as bars_lib
 from kslc_jax.evaluation import tables
 from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
@@ -163,12 +163,23 @@ def _speeds(size: Size, args: Args, policy, progress: Progress) -> list[dict[str
     return measured(policy, plain, size.speeds, size.seeds, args.seed, told)
 
 
+def robots_that_differ(name: str) -> RandomizeConfig:
+    """What the laptop preset draws for each robot of this name; without pushes and punches.
+
+    It is the same for all policies of a robot, whatever they were trained with.
+    """
+    from kslc_jax import similar
+
+    drawn = similar.preset("laptop", name).randomize
+    return dataclasses.replace(drawn, push_seconds=0.0, punch=(0.0, 0.0), held_arms=0.0)
+
+
 def _schedules(
     size: Size, args: Args, policy, progress: Progress
 ) -> dict[str, list[dict[str, Any]]]:
     from kslc_jax.evaluation import scheduled, schedules, trials
 
-    found = {}
+    found, robots = {}, robots_that_differ(policy.config.physics.robot)
     schedule = schedules.named(SCHEDULE, policy.config, float(policy.curriculum.v_max))
     for i, heading in enumerate(size.headings):
 
@@ -176,7 +187,10 @@ def _schedules(
             progress("schedules", (i + share) / len(size.headings))
 
         setting = trials.Setting(
-            trials.engine(policy, "high"), seconds=size.schedule_seconds, heading=heading
+            trials.engine(policy, "high"),
+            randomize=robots,
+            seconds=size.schedule_seconds,
+            heading=heading,
         )
         found[f"heading={heading:.2f}"] = scheduled.measure(
             policy, setting, [schedule], size.schedule_robots, args.seed, told

@@ -1,8 +1,9 @@
 """Measure the learning curve of each commanded speed: python -m kslc_jax.learning RUN [RUN ...]
 
 Evaluates the policies that a training kept along the way (--run.snapshots). They run at fixed
-commands in the training engine. Writes learning.json into the run folder. `python -m kslc_jax.plots
-learning` draws it, and groups several seeds of one method.
+commands in full C MuJoCo, because a policy that runs well in the training engine may fall there.
+With --fidelity train they run in the training engine, which is faster. Writes learning.json into
+the run folder. `python -m kslc_jax.plots learning` draws it, and groups the seeds of one method.
 
 Examples:
   python -m kslc_jax.learning runs/laptop-seed0 runs/laptop-seed1
@@ -19,7 +20,7 @@ from rich.progress import Progress
 
 from kslc_jax import cli, evaluate, files
 from kslc_jax.cli import Paths
-from kslc_jax.config import ConfigError
+from kslc_jax.config import ConfigError, Fidelity
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Args:
     """Trials per speed and policy."""
     seconds: float = 10.0
     """Length of a trial [s]."""
+    fidelity: Fidelity = "high"
+    """high: full C MuJoCo at 1 ms. train: the engine of the training."""
 
     def __post_init__(self):
         if not self.runs:
@@ -71,7 +74,7 @@ def curve(
     folders = snapshots(run)
     for i, folder in enumerate(folders):
         policy = load_policy(folder)
-        setting = trials.Setting(policy.config.physics, seconds=args.seconds)
+        setting = trials.Setting(trials.engine(policy, args.fidelity), seconds=args.seconds)
         rows = measure(
             policy,
             setting,
@@ -85,6 +88,7 @@ def curve(
         "run": run.resolve().name,
         "seeds": args.seeds,
         "seconds": args.seconds,
+        "fidelity": args.fidelity,
         "points": points,
     }
 

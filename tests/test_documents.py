@@ -1,5 +1,7 @@
 """The documents: links have a target, names exist, the index lists every page."""
 
+import ast
+import importlib.util
 import json
 import re
 import subprocess
@@ -114,3 +116,25 @@ def test_a_folder_of_somebodys_machine_is_found():
     folder = "/".join(["", "home", "me", "runs"])
     assert absolute_paths(f'{{"policy": "{folder}"}}'.encode()) == [b"/home/" + b"me"]
     assert absolute_paths(b"runs/tmp/x https://example.org/home/x") == []
+
+
+CODE = r"^```python$(.*?)^```$"
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_what_documents_name_in_the_code_exists(path):
+    """Places such as `env.py:step`, and the imports of code blocks."""
+    named = re.findall(r"`((?:\w+/)*\w+\.py):([A-Za-z]\w*)`", path.read_text())
+    ours = [(ROOT / "kslc_jax" / file, name) for file, name in named if "test_" not in file]
+    for file, name in ours:
+        assert re.search(rf"^\s*(def|class) {name}\b|^{name}\b", file.read_text(), re.M), (
+            file,
+            name,
+        )
+    for block in re.findall(CODE, path.read_text(), re.M | re.S):
+        for node in ast.walk(ast.parse(block)):
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("kslc_jax"):
+                module = importlib.import_module(str(node.module))
+                for alias in node.names:
+                    whole = f"{node.module}.{alias.name}"
+                    assert hasattr(module, alias.name) or importlib.util.find_spec(whole), whole

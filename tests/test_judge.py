@@ -136,6 +136,7 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
         return [row(speed) for speed in speeds]
 
     def under(policy, setting, plans, robots, seed, progress):
+        assert setting.randomize == judge.robots_that_differ("xbot_l")
         progress(1.0)
         return [{"schedule": plan.name, "survival": 0.5} for plan in plans]
 
@@ -151,6 +152,13 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
     kept = json.loads(out.read_text())
     assert len(kept["bars"]) == 12 and kept["size"]["seeds"] == judge.FULL.seeds
     assert len(kept["perturbed"]) == 16 and len(kept["schedules"]) == 4
+
+
+def test_the_robots_of_the_schedules_differ_in_more_than_their_base():
+    drawn = judge.robots_that_differ("xbot_l")
+    assert drawn.link_mass == (0.9, 1.1) and drawn.hand_mass == (0.0, 0.5)
+    assert drawn.friction[0] < drawn.friction[1] and drawn.motor_strength == (0.9, 1.0)
+    assert not drawn.push_seconds and drawn.punch == (0.0, 0.0) and not drawn.held_arms
 
 
 def test_errors_are_one_line(capsys):

@@ -448,6 +448,17 @@ def edited(
     return description.read(str(folder / "biped.toml"))
 
 
+@pytest.mark.parametrize("second", ['<velocity joint="mast" kv="3" gear="2"/>', ""])
+def test_position_and_velocity_actuators_of_a_joint_add_up(tmp_path, second):
+    """80 N m/rad and 1 N m s/rad, and from the second one 3 * 2^2."""
+    two = '<position joint="mast" kp="80" kv="1"/>' + second
+    about = edited(tmp_path, xml=(('<position joint="mast"/>', two),))
+    model = build.spec(about, "train").compile()
+    mast = model.actuator("mast")
+    assert mast.gainprm[0] == 80.0
+    assert -mast.biasprm[2] == (13.0 if second else 1.0)
+
+
 DESCRIPTIONS = {
     "unknown field": ('motor = 1\nmjcf = "biped.xml"', "unknown field 'motor' (closest: motors)"),
     "no mjcf": ("weld = []", "mjcf is missing"),

@@ -23,7 +23,7 @@ def _name(path: Path) -> str:
 MODULES = {_name(path): path for path in sorted(ROOT.rglob("*.py"))}
 
 WINGS = ("kslc_jax.evaluation", "kslc_jax.viewer", "kslc_jax.checkup")
-COMMANDS = tuple(f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "play", "export"))
+COMMANDS = tuple(f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "judge", "play", "export"))
 NO_TRAINING = [n for n in MODULES if n.startswith(WINGS) or n in ("kslc_jax.policy", *COMMANDS)]
 
 OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "viser"}
@@ -42,7 +42,7 @@ LIGHT = (
     "sim2sim",
     "play",
 )
-LIGHT += ("export", "compare", "reproduce", "doctor", "learning", "plots", "records")
+LIGHT += ("judge", "export", "compare", "reproduce", "doctor", "learning", "plots", "records")
 LIGHT += ("evaluation.tables", "evaluation.perturbations")
 """Modules that do not import JAX, so that a config check and `--help` are quick."""
 

@@ -69,14 +69,18 @@ def motors(description: Description, model: mujoco.MjModel, joints: list[int]) -
 
 
 def _of_mjcf(model: mujoco.MjModel, joint: int) -> Motor:
-    """What an MJCF says about one joint's motor."""
+    """The motor of one joint, as the MJCF has it; what the MJCF leaves open is None.
+
+    The gains of a joint's actuators add up: some MJCFs have one for the position and one for the
+    velocity.
+    """
     dof = model.jnt_dofadr[joint]
     motor = Motor(
         armature=float(model.dof_armature[dof]),
         friction=float(model.dof_frictionloss[dof]),
         damping=float(model.dof_damping[dof]),
     )
-    efforts = []
+    efforts, gains = [], np.zeros(2)
     if model.jnt_actfrclimited[joint]:
         efforts.append(np.abs(model.jnt_actfrcrange[joint]).max())
     drives = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (
@@ -87,11 +91,11 @@ def _of_mjcf(model: mujoco.MjModel, joint: int) -> Motor:
         if model.actuator_forcelimited[i]:
             efforts.append(gear * np.abs(model.actuator_forcerange[i]).max())
         if model.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_AFFINE:
-            kd = -float(model.actuator_biasprm[i, 2]) * gear**2
-            motor = replace(motor, kp=float(gain) * gear**2, kd=kd if kd > 0 else None)
+            gains -= model.actuator_biasprm[i, 1:3] * gear**2
         elif model.actuator_ctrllimited[i]:
             efforts.append(gear * gain * np.abs(model.actuator_ctrlrange[i]).max())
-    return replace(motor, effort=float(min(efforts))) if efforts else motor
+    kp, kd = (float(gain) if gain > 0 else None for gain in gains)
+    return replace(motor, kp=kp, kd=kd, effort=float(min(efforts)) if efforts else None)
 
 
 def add_servos(spec: mujoco.MjSpec, motors: list[Motor], high: bool) -> None:
