@@ -81,13 +81,14 @@ def sweep(
     args: Args, policy: "Policy", progress: Callable[[float], None] = lambda share: None
 ) -> list[Row]:
     """One row of metrics per commanded speed."""
-    from kslc_jax.evaluation import trials
+    from kslc_jax.evaluation import trained, trials
     from kslc_jax.evaluation.measure import measure
 
     terrain = None if args.ground is None else perturbations.terrain(args.ground)
     engine = trials.engine(policy, args.fidelity, terrain)
     setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
-    return measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
+    rows = measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
+    return [row | trained.beyond(policy, setting, (row["command"], 0.0, 0.0)) for row in rows]
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -189,8 +189,8 @@ class EnvConfig:
     privileged_frames: int = 3
     """Frames of critic history (paper, Table I)."""
     arms: Literal["free", "held"] = "free"
-    """free: the policy moves the arms. held: arm actions are ignored and servos keep the arms at
-    zero (ablation, baseline). The gait's reference must then not move the arms."""
+    """free: the policy moves the arms. held: arm actions are ignored and servos keep the arms in
+    the home pose (ablation, baseline). The gait's reference must then not move the arms."""
     reset_joint_noise: float = 0.1
     """Initial joint angles are default + U(-x, x) [rad] (HG)."""
 
