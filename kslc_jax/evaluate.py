@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import tyro
 from rich.progress import Progress
@@ -21,7 +21,7 @@ from rich.progress import Progress
 from kslc_jax import cli, files
 from kslc_jax.config import ConfigError, Fidelity, require_seed
 from kslc_jax.evaluation import perturbations
-from kslc_jax.evaluation.tables import Row, console, table
+from kslc_jax.evaluation.tables import console, table
 
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
@@ -79,8 +79,8 @@ def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
 
 def sweep(
     args: Args, policy: "Policy", progress: Callable[[float], None] = lambda share: None
-) -> list[Row]:
-    """One row of metrics per commanded speed."""
+) -> list[dict[str, Any]]:
+    """One row of metrics per commanded speed; `beyond`: what the policy was not trained for."""
     from kslc_jax.evaluation import trained, trials
     from kslc_jax.evaluation.measure import measure
 

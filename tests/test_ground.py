@@ -327,13 +327,14 @@ class TestJudging:
     @pytest.mark.parametrize("fidelity", ["train", "high"])
     def test_evaluate_tries_the_policy_on_it(self, fidelity, monkeypatch):
         """`evaluate --ground` gives the trials this ground at both fidelities."""
-        settings = []
+        settings, rows = [], [{"command": 1.0}]
         monkeypatch.setattr(
-            measure, "measure", lambda policy, setting, *_: settings.append(setting)
+            measure, "measure", lambda policy, setting, *_: settings.append(setting) or rows
         )
         for name in (None, "slope:10"):
             args = evaluate.Args("x", ground=name, fidelity=fidelity)
-            evaluate.sweep(args, load_policy("xbot_l_run"))
+            (row,) = evaluate.sweep(args, load_policy("xbot_l_run"))
+            assert row.get("beyond") == (["ground"] if name else None)
         assert [s.physics.uneven for s in settings] == [None, only("slope")]
         assert all(s.physics.fidelity == fidelity for s in settings)
         with pytest.raises(ConfigError, match="ground: "):

@@ -231,7 +231,9 @@ def test_a_row_is_of_its_command_and_conditions(still, monkeypatch):
     args = evaluate.Args(
         Path("x"), (0.5, 2.0), seeds=3, seconds=3.0, fidelity="high", noise=True, seed=5
     )
-    assert evaluate.sweep(args, still) == [{"command": v, "vx": v} for v in (0.5, 2.0)]
+    marks = {}, {"beyond": ["speed"]}  # its range ends at 0.5 m/s
+    rows = [{"command": v, "vx": v} | mark for v, mark in zip((0.5, 2.0), marks, strict=True)]
+    assert evaluate.sweep(args, still) == rows
     ((setting, seed),) = asked
     assert setting.physics == HighFidelity() and setting.noise and seed == 5
     evaluate.sweep(dataclasses.replace(args, fidelity="train", noise=False), still)
