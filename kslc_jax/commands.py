@@ -7,6 +7,9 @@ import jax.numpy as jnp
 from kslc_jax import draws, maths
 from kslc_jax.config import CommandConfig
 
+BRAKES_FROM = 0.5
+"""Share of the largest vx above which a command may be followed by one that brakes."""
+
 TURNING = 0.1
 """Commanded yaw rate [rad/s] above which a robot with a zero velocity command must step."""
 
@@ -26,13 +29,15 @@ def sample(
     vx_range: tuple[jax.Array, jax.Array],
     yaw: jax.Array,
     top_width: float,
+    before: jax.Array | float = 0.0,
 ) -> Command:
-    """Draws a command for a robot whose present heading is `yaw` [rad].
+    """Draws a command for a robot with the heading `yaw` [rad]; `before` [m/s] was its vx till now.
 
     vx is uniform in `vx_range` [m/s]. A share `slow_fraction` of the commands uses only the part up
     to `slow_speed`, and a share `top_fraction` only the uppermost `top_width` [m/s]. With
     `narrow_speed`, vy and the change of heading shrink linearly with |vx|. A share `stand_fraction`
-    has zero velocity and keeps its heading. A share `forward_fraction` goes straight ahead.
+    has zero velocity and keeps its heading. A share `forward_fraction` goes straight ahead. After
+    fast commands a share `brake_fraction` stops or reverses.
     """
     part, speed, sideways, turn, kind = jax.random.uniform(key, (5,))
     low, high = vx_range
@@ -51,6 +56,12 @@ def sample(
 
     stand = kind < config.stand_fraction
     forward = kind < config.stand_fraction + config.forward_fraction
+    if config.brake_fraction > 0:
+        draw = jax.random.uniform(jax.random.fold_in(key, 1))
+        brakes = (before > BRAKES_FROM * vx_range[1]) & (draw < config.brake_fraction)
+        reverses = brakes & (draw < 0.5 * config.brake_fraction)
+        vx = jnp.where(reverses, vx_range[0], vx)
+        stand, forward = jnp.where(brakes, ~reverses, stand), forward | brakes
     vx = jnp.where(stand, 0.0, vx)
     vy = jnp.where(forward, 0.0, vy)
     heading = jnp.where(forward, yaw, heading)

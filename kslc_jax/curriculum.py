@@ -28,7 +28,7 @@ class Curriculum:
     gait: jax.Array  # [] moving average of feet_contact_number, fast commands, -0.3 to 1
     top_deviation: jax.Array  # [] m/s, fading sum of vx - commanded vx, settled at the top
     top_scale: jax.Array  # [] m/s, fading sum of max(commanded vx, `top_error_floor`), same
-    top_falls: jax.Array  # [] fading sum of falls under commands at the top
+    top_falls: jax.Array  # [] fading sum of falls under and soon after commands at the top
     top_minutes: jax.Array  # [] fading sum of minutes under commands at the top
     updates: jax.Array  # [] int, updates since the last change
 
@@ -46,7 +46,7 @@ class Progress:
     gait: jax.Array  # [] mean of feet_contact_number over the samples with a fast command
     top_deviation: jax.Array  # [] m/s, sum of vx - commanded vx, settled at the top
     top_scale: jax.Array  # [] m/s, sum of max(commanded vx, `top_error_floor`), same samples
-    top_falls: jax.Array  # [] falls under commands at the top
+    top_falls: jax.Array  # [] falls under commands at the top, and up to `falls_after` later
     top_minutes: jax.Array  # [] minutes under commands at the top, sum over the robots
 
 
@@ -96,7 +96,7 @@ def top_error(state: Curriculum) -> jax.Array:
 
 
 def top_falls(state: Curriculum) -> jax.Array:
-    """Falls per minute [] under commands at the top."""
+    """Falls per minute [] of commands at the top, see `CurriculumConfig.falls_after`."""
     return state.top_falls / jnp.maximum(state.top_minutes, 1e-6)
 
 

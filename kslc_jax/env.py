@@ -32,6 +32,9 @@ from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics
 from kslc_jax.signals import Signals
 
+NEVER = -1_000_000
+"""`EnvState.top_until` of a robot that has had no command at the top."""
+
 DIVERGED = 1e3
 """Physics with a speed [m/s, rad/s] of this size, or with non-finite numbers, has diverged."""
 
@@ -46,6 +49,7 @@ class EnvState:
     command: Command
     command_since: jax.Array  # [] int, `time` when the command was drawn
     command_until: jax.Array  # [] int, `time` when the next one is drawn
+    top_until: jax.Array  # [] int, `time` when the last command at the top ended, see is_top
     history: jax.Array  # [K, W] actor frames, oldest first
     privileged_history: jax.Array  # [Kp, W] critic frames, oldest first
     last_action: jax.Array  # [n] as applied
@@ -68,6 +72,7 @@ class Outcome:
     settled: jax.Array  # [] bool, the command is unchanged for `settle_seconds` or longer
     fast: jax.Array  # [] bool, settled and in the top part of the range, see is_fast
     top: jax.Array  # [] bool, the command is less than one `v_step` below v_max
+    braking: jax.Array  # [] bool, such a command has ended within the last `falls_after` seconds
     commanded: jax.Array  # [] m/s, commanded vx
     speed: jax.Array  # [] m/s, vx of the base, base frame
     episode_steps: jax.Array  # [] int, age of the episode, see train_step.init
@@ -101,6 +106,7 @@ def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         command=command,
         command_since=jnp.zeros((), jnp.int32),
         command_until=commands.holding_steps(config.command, keys[4], config.control_dt),
+        top_until=jnp.full((), NEVER, jnp.int32),
         history=jnp.zeros((config.env.frames, observations.actor_width(robot))),
         privileged_history=jnp.zeros(
             (config.env.privileged_frames, observations.critic_width(robot))
@@ -165,6 +171,7 @@ def step(
         last_last_action=state.last_action,
         last_base_velocity=now.base_velocity,
         time=time,
+        top_until=jnp.where(outcome.top, time, state.top_until),
         disturbances=disturbed,
     )
     state = _resample(config, state, keys[1], curriculum, now)
@@ -221,6 +228,8 @@ def _outcome(
         settled=settled,
         fast=settled & curriculum_lib.is_fast(config.curriculum, curriculum, vx),
         top=curriculum_lib.is_top(config.curriculum, curriculum, vx),
+        braking=(before.time - before.top_until) * config.control_dt
+        < config.curriculum.falls_after,
         commanded=vx,
         speed=now.base_linvel[0],
         episode_steps=time,
@@ -247,12 +256,16 @@ def _applied_action(
 
 
 def _sample_command(
-    config: Config, key: jax.Array, curriculum: Curriculum, now: Signals
+    config: Config,
+    key: jax.Array,
+    curriculum: Curriculum,
+    now: Signals,
+    before: jax.Array | float = 0.0,
 ) -> Command:
-    """Draws a command from the curriculum's present range."""
+    """Draws a command from the curriculum's present range; `before` [m/s]: vx of the one before."""
     vx_range = (jnp.asarray(config.curriculum.v_min), curriculum.v_max)
     top_width = config.curriculum.v_step
-    return commands.sample(config.command, key, vx_range, now.base_euler[2], top_width)
+    return commands.sample(config.command, key, vx_range, now.base_euler[2], top_width, before)
 
 
 def _resample(
@@ -261,7 +274,7 @@ def _resample(
     """Draws a new command if the time of the old one is over."""
     key_command, key_time = jax.random.split(key)
     fresh = state.replace(
-        command=_sample_command(config, key_command, curriculum, now),
+        command=_sample_command(config, key_command, curriculum, now, state.command.velocity[0]),
         command_since=state.time,
         command_until=state.time
         + commands.holding_steps(config.command, key_time, config.control_dt),

@@ -225,7 +225,7 @@ def progress_of(config: Config, out: Outcome) -> Progress:
         gait=gait,
         top_deviation=jnp.sum((out.speed - out.commanded) * settled_top),
         top_scale=jnp.sum(jnp.maximum(out.commanded, floor) * settled_top),
-        top_falls=jnp.sum(out.terminated & top),
+        top_falls=jnp.sum(out.terminated & (out.top | out.braking) & ~out.broken),
         top_minutes=jnp.sum(top) * (config.control_dt / 60.0),
     )
 

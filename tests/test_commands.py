@@ -23,9 +23,9 @@ def draw(vx=0.0, vy=0.0, heading=0.0, yaw=0.0, **changes):
     return commands.sample(config, KEY, (jnp.asarray(vx), jnp.asarray(vx)), jnp.asarray(yaw), 0.5)
 
 
-def draw_many(config: CommandConfig, n=4000, vx=(-0.3, 3.5), yaw=0.0):
-    bounds = jnp.asarray(vx[0]), jnp.asarray(vx[1])
-    sample = jax.vmap(lambda key: commands.sample(config, key, bounds, jnp.asarray(yaw), 0.5))
+def draw_many(config: CommandConfig, n=4000, vx=(-0.3, 3.5), yaw=0.0, before=0.0):
+    bounds, yaw = (jnp.asarray(vx[0]), jnp.asarray(vx[1])), jnp.asarray(yaw)
+    sample = jax.vmap(lambda key: commands.sample(config, key, bounds, yaw, 0.5, before))
     return sample(jax.random.split(KEY, n))
 
 
@@ -144,6 +144,19 @@ def test_a_share_of_the_commands_is_slow():
     config = dataclasses.replace(PAPER, dead_zone=0.0, slow_fraction=0.25, slow_speed=1.0)
     speeds = np.asarray(draw_many(config).velocity[:, 0])
     assert (speeds < 1.0).mean() == pytest.approx(0.25 + 0.75 * 1.3 / 3.8, abs=0.03)
+
+
+@pytest.mark.parametrize(("before", "share"), [(3.0, 0.4), (1.5, 0.0)])
+def test_fast_commands_are_followed_by_stops_and_reversals(before, share):
+    """Of those above half of the range, 3.5 m/s, two fifths: half stand, half go back at -0.3 m/s.
+    They go straight."""
+    config = dataclasses.replace(PAPER, dead_zone=0.0, brake_fraction=0.4)
+    drawn = draw_many(config, before=before)
+    vx, vy, _ = np.asarray(drawn.velocity).T
+    stops, reversals = vx == 0.0, vx == np.float32(-0.3)
+    assert stops.mean() == pytest.approx(share / 2, abs=0.03)
+    assert reversals.mean() == pytest.approx(share / 2, abs=0.03)
+    assert not vy[stops | reversals].any()
 
 
 @pytest.mark.parametrize(

@@ -187,6 +187,29 @@ def test_tracking_settles_two_seconds_after_a_new_command(setting):
         assert bool(outcome.settled) == settled, time
 
 
+def test_a_robot_brakes_for_four_seconds_after_its_last_command_at_the_top(setting):
+    """The range ends at 0.5 m/s: a command of 0.3 m/s is at its top, and one of -0.2 is not."""
+    config, reset, step = setting
+    after = config.curriculum.falls_after
+    state = reset(jax.random.key(3)).replace(command_until=jnp.int32(2000))
+    assert int(state.top_until) == env.NEVER
+
+    def stepped(state, vx, time):
+        velocity = jnp.array([vx, 0.0, 0.0])
+        command = state.command.replace(velocity=velocity)
+        now = state.replace(command=command, time=jnp.int32(time))
+        return step(now, jnp.zeros(16), jax.random.key(4))
+
+    _, outcome = stepped(state, -0.2, 100)
+    assert not outcome.top and not outcome.braking
+    fast, outcome = stepped(state, 0.3, 100)
+    assert outcome.top and int(fast.top_until) == 101
+    for time, braking in ((101, True), (500, after > 3.99), (501, after > 4.0)):
+        slow, outcome = stepped(fast, -0.2, time)
+        assert not outcome.top and int(slow.top_until) == 101
+        assert bool(outcome.braking) == (braking and after > 0), time
+
+
 def test_jit_equals_no_jit_and_batch_of_one():
     """The tolerance is 1e-4, because fused float32 programs add in another order."""
     config = preset("debug")

@@ -157,7 +157,7 @@ def test_metadata(symmetric, xbot):
         "cycle_follows_speed": False,
         "base_cycle_time": 0.64,
         "cycle_from_speed": 0.5,
-        "cycle_factor": 0.925,
+        "cycle_factor": 0.94,
         "speed_step": 0.5,
     }
     assert data["command"]["stand_still"] and data["command"]["dead_zone"] == 0.2

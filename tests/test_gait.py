@@ -161,7 +161,7 @@ def with_gait(**changes):
 
 @pytest.mark.parametrize("vx", [0.0, 0.3, 0.5, -0.3, 0.75, 1.0, 2.0, 3.3])
 def test_the_cycle_of_a_command_is_the_same_for_every_range(vx):
-    """It is 0.64 x 0.925^((v - 0.5) / 0.5): the curriculum's cycle when v was its top speed."""
+    """It is 0.64 x 0.94^((v - 0.5) / 0.5): the curriculum's cycle when v was its top speed."""
     config, command = preset("laptop"), make_command(velocity=[vx, 0.0, 0.0])
     state, found = curriculum.init(config), []
     open_ = dataclasses.replace(config.curriculum, cycle_min=0.38)
@@ -172,16 +172,17 @@ def test_the_cycle_of_a_command_is_the_same_for_every_range(vx):
         state = state.replace(
             v_max=state.v_max + open_.v_step, cycle_time=state.cycle_time * open_.cycle_factor
         )
-    expected = 0.64 * 0.925 ** (max(abs(vx) - 0.5, 0.0) / 0.5)
+    expected = 0.64 * 0.94 ** (max(abs(vx) - 0.5, 0.0) / 0.5)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
 
 
 def test_the_cycle_is_never_below_the_curriculums():
-    """Without the cycle curriculum (an ablation) the cycle stays 0.64 s. At the end of the
-    curriculum it is 0.38 s."""
+    """Without the cycle curriculum (an ablation) the cycle stays 0.64 s. Where the curriculum's is
+    0.42 s, so is that of the fastest command; alone it would be 0.39 s."""
     config, command = preset("laptop"), make_command(velocity=[4.5, 0.0, 0.0])
     assert float(gait.cycle_time(config, command, 0.64, 4.5)) == pytest.approx(0.64)
-    assert float(gait.cycle_time(config, command, 0.38, 4.5)) == pytest.approx(0.38)
+    assert float(gait.cycle_time(config, command, 0.42, 4.5)) == pytest.approx(0.42)
+    assert float(gait.cycle_time(config, command, 0.38, 4.5)) == pytest.approx(0.3901, abs=1e-4)
 
 
 # ---------------------------------------------------------------------------------- reference pose

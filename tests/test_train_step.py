@@ -156,7 +156,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
 
     monkeypatch.setattr(train_step.ppo, "update", update)
     monkeypatch.setattr(
-        train_step, "_metrics", lambda c, new, out, p, losses: losses | {"outcome": out}
+        train_step, "metrics_of", lambda c, new, out, p, losses: losses | {"outcome": out}
     )
     state, n = init(), config.env.num_envs
     half, old = jnp.arange(n) < n // 2, state.env
@@ -210,24 +210,26 @@ def test_robots_start_unlike_each_other(made):
 
 def test_slow_commands_at_the_top_count_as_if_they_were_faster():
     """Commands of 0.5 and 4.0 m/s give speeds of 0.4 and 4.3 m/s: deviation -0.1 + 0.3, scale 3.0 +
-    4.0. The third command has not settled, and the fourth is not at the top."""
-    no = jnp.zeros(4, bool)
+    4.0. The third command has not settled, and the others are not at the top. Three robots fall at
+    the top or soon after it; the fourth falls elsewhere, and the sixth is broken."""
+    no = jnp.zeros(6, bool)
     out = env.Outcome(
-        reward=jnp.zeros(4),
-        terminated=jnp.array([False, True, True, True]),
+        reward=jnp.zeros(6),
+        terminated=jnp.array([False, True, True, True, True, True]),
         truncated=no,
-        broken=no,
-        terms={"tracking_lin_vel": jnp.zeros(4), "feet_contact_number": jnp.zeros(4)},
-        settled=jnp.array([True, True, False, True]),
+        broken=no.at[5].set(True),
+        terms={"tracking_lin_vel": jnp.zeros(6), "feet_contact_number": jnp.zeros(6)},
+        settled=jnp.array([True, True, False, True, False, False]),
         fast=no,
-        top=jnp.array([True, True, True, False]),
-        commanded=jnp.array([0.5, 4.0, 4.0, 1.0]),
-        speed=jnp.array([0.4, 4.3, 0.0, 0.0]),
-        episode_steps=jnp.zeros(4, int),
+        top=jnp.array([True, True, True, False, False, False]),
+        braking=jnp.array([False, False, False, False, True, True]),
+        commanded=jnp.array([0.5, 4.0, 4.0, 1.0, 0.0, 0.0]),
+        speed=jnp.array([0.4, 4.3, 0.0, 0.0, 0.0, 0.0]),
+        episode_steps=jnp.zeros(6, int),
         speeding=no,
     )
     progress = train_step.progress_of(preset("laptop"), out)
     assert float(progress.top_deviation) == pytest.approx(0.2)
     assert float(progress.top_scale) == pytest.approx(7.0)
-    assert float(progress.top_falls) == 2.0
+    assert float(progress.top_falls) == 3.0
     assert float(progress.top_minutes) == pytest.approx(3 * 0.01 / 60)

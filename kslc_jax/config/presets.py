@@ -58,6 +58,7 @@ _LAPTOP = _override(
         "forward_fraction": 0.2,
         "slow_fraction": 0.15,
         "top_fraction": 0.15,
+        "brake_fraction": 0.3,
         "narrow_speed": 4.0,
         "stand_still": True,
     },
@@ -80,7 +81,8 @@ _LAPTOP = _override(
         "top_error_from": 1.75,
         "top_error_floor": 3.0,
         "top_falls": 1.0,
-        "cycle_factor": 0.925,
+        "falls_after": 4.0,
+        "cycle_factor": 0.94,
         "cycle_min": 0.38,
     },
     randomize={

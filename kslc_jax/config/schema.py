@@ -237,6 +237,10 @@ class CommandConfig:
     top_fraction: float = 0.0
     """Share of commands with vx from the top `curriculum.v_step` of the range. Changes from and to
     the top speed are rare otherwise."""
+    brake_fraction: float = 0.0
+    """Share of the commands that brake hard, among those that follow a vx in the upper half of the
+    range: half of them mean "stand", half go backwards as fast as the range allows. Such changes
+    are rare otherwise."""
     narrow_speed: float = 0.0
     """vy and heading changes shrink linearly with |vx| and are 0 from this speed [m/s] on. 0: they
     never shrink."""
@@ -258,6 +262,7 @@ class CommandConfig:
             "command.slow_fraction + command.top_fraction must lie in [0, 1]",
         )
         require(self.slow_speed > 0, "command.slow_speed must be positive")
+        require(0 <= self.brake_fraction <= 1, "command.brake_fraction must lie in [0, 1]")
         require(
             0 <= self.shortest_seconds <= self.resample_seconds,
             "command.shortest_seconds must lie in [0, command.resample_seconds]",
@@ -533,6 +538,9 @@ class CurriculumConfig:
     walking then needs less relative accuracy."""
     top_falls: float = 1e9
     """Most falls per minute under commands in the top `v_step`. 1e9: no condition."""
+    falls_after: float = 0.0
+    """For `top_falls`, falls also count so long [s] after such a command has ended: many robots
+    fall when they brake."""
     settle_seconds: float = 0.0
     """A command is "settled" this long [s] after it changed; only settled commands count for
     tracking. A robot needs time to reach a new speed, and more in a wider range."""
@@ -553,6 +561,7 @@ class CurriculumConfig:
         require(self.top_error > 0, "curriculum.top_error must be positive")
         require(self.top_error_floor > 0, "curriculum.top_error_floor must be positive")
         require(self.top_falls >= 0, "curriculum.top_falls must not be negative")
+        require(self.falls_after >= 0, "curriculum.falls_after must not be negative")
 
 
 @dataclass(frozen=True)
