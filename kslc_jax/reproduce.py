@@ -21,7 +21,7 @@ import tyro
 from rich.progress import Progress
 from rich.table import Table
 
-from kslc_jax import cli, evaluate, files, runtime, similar
+from kslc_jax import cli, evaluate, files, runtime
 from kslc_jax import config as config_lib
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.evaluation.tables import console
@@ -79,6 +79,8 @@ def stored(folder: Path, name: str) -> dict[str, Any]:
 
 def of_an_older_recipe(config: Config) -> bool:
     """True if the default preset differs from the config, in more than seed and run options."""
+    from kslc_jax import similar
+
     today = similar.preset("laptop", config.physics.robot)
     return dataclasses.replace(today, seed=config.seed, run=config.run) != config
 

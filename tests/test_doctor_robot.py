@@ -271,7 +271,7 @@ def test_the_picture(biped, tmp_path):
     picture.draw(biped.high, out)
     assert 10_000 < out.stat().st_size < 300_000
     with pytest.raises(UserError, match="cannot write"):
-        picture.draw(biped.high, tmp_path / "nowhere" / "robot.png")
+        picture.draw(biped.high, out / "no folder" / "robot.png")
 
 
 def test_the_command(tmp_path, capsys):
