@@ -129,10 +129,10 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
 
 def require_ours(job: Job) -> None:
     """ConfigError or RunError if the folder holds a training with another config."""
-    from kslc_jax.training import run_folder
+    from kslc_jax.training import run_folder, same_training
 
     if (job.folder / files.CONFIG).exists():
-        run_folder.difference(run_folder.read_config(job.folder), job.config)
+        same_training.difference(run_folder.read_config(job.folder), job.config)
 
 
 def run(job: Job, steps: int) -> bool:

@@ -42,7 +42,7 @@ from kslc_jax.evaluation import gait_metrics, perturbations, trials, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robots import copying, description
 from kslc_jax.robots.description import RobotError
-from kslc_jax.training import run_folder, starting
+from kslc_jax.training import run_folder, same_training, starting
 from kslc_jax.training.checkpoint_process import LocalStorage
 
 BIPED = str(Path(__file__).parent / "data" / "biped.toml")
@@ -335,7 +335,7 @@ def test_a_training_keeps_its_robot(mine, tmp_path):
     kept = run_folder.read_config(run)
     assert kept.physics.robot == str(run / "robot" / "biped.toml")
     assert str(tmp_path) not in (run / "config.json").read_text()
-    run_folder.difference(kept, setup)
+    same_training.difference(kept, setup)
     run_folder.open_folder(run, kept, True, {})
     (run / "robot").rename(run / "robots")
     with pytest.raises(config.ConfigError, match=f"copy the folder robot of its run to {run}"):
@@ -346,7 +346,7 @@ def test_a_training_keeps_its_robot(mine, tmp_path):
     stronger.write_text(about.read_text().replace("kp = 60", "kp = 66"))
     engine = dataclasses.replace(setup.physics, robot=str(stronger))
     with pytest.raises(config.ConfigError, match=r"biped.toml has changed since .* 60 -> 66"):
-        run_folder.difference(kept, dataclasses.replace(setup, physics=engine))
+        same_training.difference(kept, dataclasses.replace(setup, physics=engine))
 
 
 def test_the_copy_of_a_robot_in_a_package_is_its_description(tmp_path):

@@ -34,6 +34,7 @@ from kslc_jax.training import (
     memory,
     recorder,
     run_folder,
+    same_training,
     starting,
 )
 from kslc_jax.training.logs import MetricsFile, Progress
@@ -474,8 +475,8 @@ def test_resume_difference_names_the_first_field():
     a = preset("debug")
     b = dataclasses.replace(a, gait=dataclasses.replace(a.gait, cycle_time=0.5))
     with pytest.raises(ConfigError, match=r"gait\.cycle_time is 0\.64.*not 0\.5"):
-        run_folder.difference(a, b)
-    run_folder.difference(a, dataclasses.replace(a, run=dataclasses.replace(a.run, steps=9)))
+        same_training.difference(a, b)
+    same_training.difference(a, dataclasses.replace(a, run=dataclasses.replace(a.run, steps=9)))
 
 
 def test_metrics_behind_the_checkpoint_are_dropped(tmp_path):

@@ -243,6 +243,11 @@ def test_folders_in_use_or_full_are_refused(training, capsys):
     )
     with pytest.raises(run_folder.RunError, match="r already holds a training of 3 seeds"):
         run_folder.open_folder(training.dir, DEBUG, False, {})
+    assert training(lambda state: state, "--resume", "--ppo.gamma", 0.9) == 2
+    said = capsys.readouterr().err
+    assert "ppo.gamma is 0.994 in the run that is there, not 0.9" in said
+    assert "To begin a new one from the start: " in said
+    assert f"--run-dir {training.dir}-2 --seeds {COUNT}" in said and "start-from" not in said
     assert sorted(training.dir.iterdir()) == training.folders
     shutil.rmtree(training.folders[1])
     assert training(lambda state: state, "--resume") == 2

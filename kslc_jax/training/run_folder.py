@@ -1,10 +1,8 @@
 """A run folder: its lock, config and versions, and the checks before a training resumes in it."""
 
 import contextlib
-import dataclasses
 import fcntl
 import importlib.metadata
-import itertools
 import json
 import os
 import platform
@@ -16,17 +14,16 @@ from typing import Any
 
 import jax
 
-from kslc_jax import __version__, files, networks, physics, similar
+from kslc_jax import __version__, files, physics
 from kslc_jax import config as config_lib
 from kslc_jax.checkpoint_format import (
     has_checkpoints,
-    identity,
     keep_robot,
 )
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.errors import UserError
-from kslc_jax.fingerprint import changes, fingerprint
 from kslc_jax.runtime import first_line
+from kslc_jax.training import same_training
 from kslc_jax.training.logs import rows_written
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -127,7 +124,7 @@ def open_folder(run_dir: Path, config: Config, resume: bool, facts: dict[str, An
       ConfigError: the training in the folder has another config.
     """
     if resume:
-        _require_same(run_dir, config)
+        same_training.require(run_dir, read_config(run_dir), config)
         return
     require_free(run_dir)
     with writing(run_dir):
@@ -235,58 +232,3 @@ def read_config(run_dir: Path) -> Config:
         raise RunError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # no JSON, or no text
         raise ConfigError(f"{path} is damaged: {first_line(error)}") from error
-
-
-def difference(stored: Config, wanted: Config) -> None:
-    """ConfigError if the configs differ. It names the first field; the part `run` may differ."""
-
-    def walk(a: object, b: object, where: str) -> None:
-        if dataclasses.is_dataclass(a):
-            for f in dataclasses.fields(a):
-                walk(getattr(a, f.name), getattr(b, f.name), f"{where}.{f.name}".lstrip("."))
-        elif a != b and not (where == "physics.robot" and _same_robot(str(a), str(b))):
-            raise ConfigError(f"{where} is {a} in the run that is there, not {b}")
-
-    for f in dataclasses.fields(stored):
-        if f.name != "run":
-            walk(getattr(stored, f.name), getattr(wanted, f.name), f.name)
-
-
-def _same_robot(stored: str, wanted: str) -> bool:
-    """True if the run's copy of a robot has the numbers of the description that is asked for.
-
-    ConfigError names the numbers that have changed since the copy was made.
-    """
-    if not all(map(config_lib.is_description, (stored, wanted))):
-        return False
-    if identity(stored) != identity(wanted):
-        return False
-    if changed := changes(fingerprint(stored), fingerprint(wanted)):
-        raise ConfigError(f"{wanted} has changed since the run began: {changed}")
-    return True
-
-
-def _require_same(run_dir: Path, wanted: Config) -> None:
-    """ConfigError if `difference` raises one. It adds the command that begins a new training."""
-    stored = read_config(run_dir)
-    try:
-        difference(stored, wanted)
-    except ConfigError as error:
-        presets = {n: similar.preset(n, wanted.physics.robot) for n in config_lib.PRESETS}
-        names = (run_dir.with_name(f"{run_dir.name}-{i}") for i in itertools.count(2))
-        command = ["python", "-m", "kslc_jax.train", *config_lib.options(wanted, presets)]
-        command += ["--run-dir", str(next(name for name in names if not name.exists()))]
-        where = "from the start"
-        if _networks(stored) == _networks(wanted):
-            command += ["--start-from", str(run_dir)]
-            where = "with this run's networks and curriculum"
-        raise ConfigError(
-            f"{error}, and --resume goes on with the same training. To begin a new one {where}: "
-            f"{shlex.join(command)}"
-        ) from error
-
-
-def _networks(config: Config) -> Any:
-    """(structure, shapes) of a config's networks."""
-    shapes = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
-    return jax.tree.structure(shapes), [x.shape for x in jax.tree.leaves(shapes)]

@@ -28,7 +28,7 @@ from kslc_jax.checkpoint_format import CheckpointError, has_checkpoints
 from kslc_jax.config import Config, RunConfig
 from kslc_jax.train_step import Metrics, TrainState
 from kslc_jax.training import recorder as recorder_lib
-from kslc_jax.training import run_folder
+from kslc_jax.training import run_folder, same_training
 from kslc_jax.training.checkpoint_process import LocalStorage
 from kslc_jax.training.logs import Progress, SeedsProgress
 from kslc_jax.training.recorder import NullRecorder, Record, Recorder
@@ -114,7 +114,11 @@ def opened(count: int) -> Callable[..., contextlib.AbstractContextManager["Seeds
         wandb: bool,
     ) -> Generator[SeedsRecorder]:
         with contextlib.ExitStack() as stack:
-            if not resume:
+            if resume:
+                folders = [files.seed_folder(run_dir, seed) for seed in files.seeds_in(run_dir)]
+                stored = [run_folder.read_config(folder) for folder in folders]
+                same_training.require_seeds(run_dir, stored, config)
+            else:
                 run_folder.require_free(run_dir)
             seeds = []
             for number in range(config.seed, config.seed + count):
