@@ -457,7 +457,7 @@ def test_drake_refuses_a_robot_that_it_cannot_take_over():
 def test_the_biped_is_tried_in_full_mujoco(untrained, tmp_path, capsys):
     policy.save_policy(untrained, tmp_path / "policy")
     out = tmp_path / "out.json"
-    short = ["--perturb", "all", "--speeds", "0.3", "--seeds", "1", "--seconds", "1"]
+    short = ["--perturb", "all", "--speeds", "0.3", "--seeds", "1", "--seconds", "3"]
     assert sim2sim.main([str(tmp_path / "policy"), *short, "--json", str(out)]) == 0
     assert len(records.read_conditions(out)) == 15
 
