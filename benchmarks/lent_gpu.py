@@ -93,8 +93,10 @@ def main(args: Args) -> int:
         print(f"error: {args.out} exists", file=sys.stderr)
         return 2
     code = train(args)
-    seeds = files.seeds_in(args.run_dir)
-    for folder in [files.seed_folder(args.run_dir, seed) for seed in seeds] or [args.run_dir]:
+    runs = [files.seed_folder(args.run_dir, seed) for seed in files.seeds_in(args.run_dir)]
+    if (args.run_dir / files.CONFIG).exists():  # one seed has no folder of its own
+        runs = [args.run_dir]
+    for folder in runs:
         sizes = carry(folder, args.out / folder.name)
         print(f"{args.out / folder.name}: {sum(sizes) / 1e6:.1f} MB", flush=True)
         code = code or int(max(sizes, default=0) > LIMIT)

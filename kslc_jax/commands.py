@@ -31,13 +31,14 @@ def sample(
     top_width: float,
     before: jax.Array | float = 0.0,
 ) -> Command:
-    """Draws a command for a robot with the heading `yaw` [rad]; `before` [m/s] was its vx till now.
+    """Draws a command for a robot with the heading `yaw` [rad].
 
-    vx is uniform in `vx_range` [m/s]. A share `slow_fraction` of the commands uses only the part up
-    to `slow_speed`, and a share `top_fraction` only the uppermost `top_width` [m/s]. With
-    `narrow_speed`, vy and the change of heading shrink linearly with |vx|. A share `stand_fraction`
-    has zero velocity and keeps its heading. A share `forward_fraction` goes straight ahead. After
-    fast commands a share `brake_fraction` stops or reverses.
+    `before` [m/s] is the vx of the command that ends now. The new vx is uniform in `vx_range`
+    [m/s]. A share `slow_fraction` of the commands uses only the part up to `slow_speed`, and a
+    share `top_fraction` only the uppermost `top_width` [m/s]. With `narrow_speed`, vy and the
+    change of heading shrink linearly with |vx|. A share `stand_fraction` has zero velocity and
+    keeps its heading. A share `forward_fraction` goes straight ahead. After fast commands a share
+    `brake_fraction` stops or reverses.
     """
     part, speed, sideways, turn, kind = jax.random.uniform(key, (5,))
     low, high = vx_range

@@ -107,7 +107,7 @@ def remaining_share(config: CurriculumConfig, state: Curriculum) -> jax.Array:
 
 
 def conditions(config: CurriculumConfig, state: Curriculum) -> dict[str, jax.Array]:
-    """What must be good enough before the range grows: name -> [] bool.
+    """The conditions for the range to grow: name -> [] bool, True if the condition is met.
 
     The last two are about commands at the top; a mean over all commands would hide them.
     """

@@ -164,9 +164,9 @@ def _speeds(size: Size, args: Args, policy, progress: Progress) -> list[dict[str
 
 
 def robots_that_differ(name: str) -> RandomizeConfig:
-    """What the laptop preset draws for each robot of this name; without pushes and punches.
+    """The randomisation of the laptop preset for the robot of this name, without pushes, punches.
 
-    It is the same for all policies of a robot, whatever they were trained with.
+    All policies of a robot are tried with it, also those of another recipe.
     """
     from kslc_jax import similar
 
@@ -266,10 +266,11 @@ def _report(args: Args) -> None:
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
-    sim2sim.simulator("drake" if args.drake else "mujoco")
+    simulator = "drake" if args.drake else "mujoco"
+    sim2sim.simulator(simulator)  # fails now if its package is missing
     policy = load_policy(args.policy)
     robot = physics.robot_for(trials.engine(policy, "high"))
-    sim2sim.require("drake" if args.drake else "mujoco", robot)
+    sim2sim.require(simulator, robot)
     size, factors = args.size.for_robot(robot), similar.factors(robot)
     about: Results = {"policy": policy_name(args.policy), "step": policy.step, "quick": args.quick}
     about |= {"seed": args.seed, "size": dataclasses.asdict(size)}

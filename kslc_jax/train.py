@@ -274,7 +274,7 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
         return error.exit_code
     except UserError:
         raise
-    except BaseException as error:
+    except (Exception, KeyboardInterrupt) as error:
         if not devices.several():
             raise
         traceback.print_exc()

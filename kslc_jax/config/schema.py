@@ -238,9 +238,9 @@ class CommandConfig:
     """Share of commands with vx from the top `curriculum.v_step` of the range. Changes from and to
     the top speed are rare otherwise."""
     brake_fraction: float = 0.0
-    """Share of the commands that brake hard, among those that follow a vx in the upper half of the
-    range: half of them mean "stand", half go backwards as fast as the range allows. Such changes
-    are rare otherwise."""
+    """After a command in the upper half of the range, this share of the next commands brakes: one
+    half means "stand", the other half goes backwards as fast as the range allows. Such changes are
+    rare otherwise."""
     narrow_speed: float = 0.0
     """vy and heading changes shrink linearly with |vx| and are 0 from this speed [m/s] on. 0: they
     never shrink."""

@@ -39,25 +39,31 @@ class Body:
 
 
 def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
-    """The conditions that the robot can have, with values that fit its size.
-
-    `hands` needs arms; `sole` needs feet that are boxes.
-    """
-    factors, out = similar.factors(robot), []
-    for condition in conditions:
-        wanted = perturbations.changes(condition).get("variation", Variation())
-        lacks_hands = wanted.hands and not len(robot.hand_body_ids)
-        if not lacks_hands and not (wanted.sole and min(_foot_boxes(robot)) < 0):
-            out.append(perturbations.scaled(condition, factors))
-    return tuple(out)
+    """The conditions that the robot can have, see `require`, with values that fit its size."""
+    factors = similar.factors(robot)
+    return tuple(
+        perturbations.scaled(condition, factors)
+        for condition in conditions
+        if not _lacking(perturbations.changes(condition).get("variation", Variation()), robot)
+    )
 
 
 def require(variation: Variation, robot: Robot) -> None:
-    """ConfigError if the robot cannot have the variation."""
+    """ConfigError if the robot cannot have the variation.
+
+    `hands` needs arms; `sole` needs feet that are boxes.
+    """
+    if lacking := _lacking(variation, robot):
+        raise ConfigError(f"{lacking}; leave it out")
+
+
+def _lacking(variation: Variation, robot: Robot) -> str:
+    """The reason why the robot cannot have the variation; empty if it can."""
     if variation.sole and min(_foot_boxes(robot)) < 0:
-        raise ConfigError(f"sole: the feet of {robot.name} are no boxes; leave it out")
+        return f"sole: the feet of {robot.name} are no boxes"
     if variation.hands and not len(robot.hand_body_ids):
-        raise ConfigError(f"hands: {robot.name} has no arms; leave it out")
+        return f"hands: {robot.name} has no arms"
+    return ""
 
 
 def _foot_boxes(robot: Robot) -> list[int]:

@@ -149,8 +149,9 @@ class Store:
                 continue
             self._put_aside(bad, step, warn)
             for reason in reasons:
-                different = "numbers differ from those of an uninterrupted training"
-                warn(f"{reason}; from here on {different}")
+                warn(
+                    f"{reason}; from here on numbers differ from those of an uninterrupted training"
+                )
             return state
         if not steps:
             raise CheckpointError(f"no checkpoint in {self.folder}")

@@ -254,9 +254,10 @@ def range_reached(config: Config, state: Curriculum) -> list[str]:
         one = jax.tree.map(lambda x, i=i: np.atleast_1d(x)[i], state)
         if limits.velocity and one.v_max < limits.v_limit:
             unmet = [name for name, met in curriculum.conditions(limits, one).items() if not met]
+            reasons = f"not good enough at the end: {', '.join(unmet)}"
             whose = f"seed {config.seed + i}: " * (np.size(state.v_max) > 1)
             lines.append(
                 f"{whose}the commands grew to {one.v_max:g} of {limits.v_limit:g} m/s; "
-                f"not good enough at the end: {', '.join(unmet) or 'nothing'}"
+                + (reasons if unmet else "all conditions for more were met")
             )
     return lines
