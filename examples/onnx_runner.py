@@ -26,11 +26,12 @@ class Controller:
     def __init__(self, path, vx, vy=0.0, heading=0.0):
         self.network = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         text = self.network.get_modelmeta().custom_metadata_map
-        if text.get("metadata_version") != "3":
-            raise SystemExit(f"error: {path} has no metadata of version 3, see docs/export.md")
+        if text.get("metadata_version") != "4":
+            raise SystemExit(f"error: {path} has no metadata of version 4, see docs/export.md")
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
-        self.velocity, self.phase = np.zeros(2), 0.0
+        self.wanted = self.velocity = np.zeros(2)
+        self.phase = 0.0
         self.command(vx, vy, heading)
         self.free = np.array([name not in m.held_joints for name in m.joint_names])
         self.action = np.zeros(len(m.joint_names))
@@ -43,9 +44,16 @@ class Controller:
         the edge of the dead zone does not start and stop the robot.
         """
         speed, edge = np.hypot(vx, vy), self.meta.command.dead_zone
-        walks = speed > (STOP if self.velocity.any() else 1) * edge
-        self.velocity = np.array([vx, vy]) * max(edge / speed, 1) if walks else np.zeros(2)
+        walks = speed > (STOP if self.wanted.any() else 1) * edge
+        self.wanted = np.array([vx, vy]) * max(edge / speed, 1) if walks else np.zeros(2)
         self.heading = heading
+        self.approach(0.0)
+
+    def approach(self, dt):
+        """Moves the velocity towards the wanted one, for `dt` seconds."""
+        way, acceleration = self.wanted - self.velocity, self.meta.command.acceleration
+        share = acceleration * dt / max(np.hypot(*way), 1e-6) if acceleration else 1
+        self.velocity = self.velocity + way * min(share, 1)
 
     def frame(self, quat, angvel, joint_pos, joint_vel):
         """The observation frame of one control step.
@@ -59,7 +67,8 @@ class Controller:
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         rate = m.command.heading_gain * ((self.heading - yaw + np.pi) % (2 * np.pi) - np.pi)
         rate = np.clip(rate, -m.command.max_yaw_rate, m.command.max_yaw_rate)
-        moving = not m.command.stand_still or self.velocity.any() or abs(rate) > m.command.turning
+        walks = self.wanted.any() or self.velocity.any()
+        moving = not m.command.stand_still or walks or abs(rate) > m.command.turning
         angle = 2 * np.pi * self.phase
         offset = joint_pos - np.array(m.default_joint_pos)
         values = dict(joint_pos=offset, joint_vel=joint_vel, last_action=self.action)
@@ -88,9 +97,9 @@ class Controller:
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
         action = np.array(self.network.run(["action"], {"history": self.history[None]})[0])[0]
         self.action = np.clip(action, -m.action_clip, m.action_clip) * self.free
-        self.phase = (
-            self.phase + (dt or m.control_dt) / self.cycle(gait, abs(self.velocity[0]))
-        ) % 1
+        dt = dt or m.control_dt
+        self.approach(dt)
+        self.phase = (self.phase + dt / self.cycle(gait, abs(self.velocity[0]))) % 1
         return m.default_joint_pos + m.action_scale * self.action
 
 

@@ -29,7 +29,7 @@ from kslc_jax.errors import UserError
 from kslc_jax.fingerprint import Fingerprint, changes, fingerprint
 from kslc_jax.robots import copying
 
-SCHEMA_VERSION = 5
+SCHEMA_VERSION = 6
 """Version of a checkpoint's items. Raise it when you change the tree of `TrainState`, and note
 below the parts that the older schemas lack."""
 

@@ -21,6 +21,12 @@ class Command:
     velocity: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s], base frame
     heading: jax.Array  # [] rad, world
     moving: jax.Array  # [] bool, False: stand still (clock off, both feet down)
+    wanted: jax.Array  # [2] m/s, vx, vy that the velocity approaches, see with_velocity
+
+
+def standing(heading: jax.Array) -> Command:
+    """The command of a robot that stands, with the heading [rad]."""
+    return Command(jnp.zeros(3), heading, jnp.zeros((), bool), jnp.zeros(2))
 
 
 def sample(
@@ -29,17 +35,18 @@ def sample(
     vx_range: tuple[jax.Array, jax.Array],
     yaw: jax.Array,
     top_width: float,
-    before: jax.Array | float = 0.0,
+    before: Command | None = None,
 ) -> Command:
     """Draws a command for a robot with the heading `yaw` [rad].
 
-    `before` [m/s] is the vx of the command that ends now. The new vx is uniform in `vx_range`
-    [m/s]. A share `slow_fraction` of the commands uses only the part up to `slow_speed`, and a
-    share `top_fraction` only the uppermost `top_width` [m/s]. With `narrow_speed`, vy and the
+    `before` is the command that ends now; None: the robot stands. The new vx is uniform in
+    `vx_range` [m/s]. A share `slow_fraction` of the commands uses only the part up to `slow_speed`,
+    and a share `top_fraction` only the uppermost `top_width` [m/s]. With `narrow_speed`, vy and the
     change of heading shrink linearly with |vx|. A share `stand_fraction` has zero velocity and
     keeps its heading. A share `forward_fraction` goes straight ahead. After fast commands a share
     `brake_fraction` stops or reverses.
     """
+    before = standing(yaw) if before is None else before
     part, speed, sideways, turn, kind = jax.random.uniform(key, (5,))
     low, high = vx_range
     if config.slow_fraction + config.top_fraction > 0:
@@ -59,15 +66,15 @@ def sample(
     forward = kind < config.stand_fraction + config.forward_fraction
     if config.brake_fraction > 0:
         draw = jax.random.uniform(jax.random.fold_in(key, 1))
-        brakes = (before > BRAKES_FROM * vx_range[1]) & (draw < config.brake_fraction)
+        brakes = (before.velocity[0] > BRAKES_FROM * vx_range[1]) & (draw < config.brake_fraction)
         reverses = brakes & (draw < 0.5 * config.brake_fraction)
         vx = jnp.where(reverses, vx_range[0], vx)
         stand, forward = jnp.where(brakes, ~reverses, stand), forward | brakes
     vx = jnp.where(stand, 0.0, vx)
     vy = jnp.where(forward, 0.0, vy)
     heading = jnp.where(forward, yaw, heading)
-    velocity = jnp.stack([vx, vy, jnp.zeros(())])
-    return steer(config, Command(velocity, heading, jnp.zeros((), bool)), yaw)
+    wanted = with_velocity(config, before, jnp.stack([vx, vy, jnp.zeros(())]))
+    return steer(config, wanted.replace(heading=heading), yaw, 0.0)
 
 
 def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> jax.Array:
@@ -79,24 +86,41 @@ def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> j
     return draws.integer_between(jax.random.uniform(key), shortest, longest)
 
 
-def steer(config: CommandConfig, command: Command, yaw: jax.Array) -> Command:
-    """Recomputes the commanded yaw rate from the heading error; called at every step (HG)."""
+def steer(config: CommandConfig, command: Command, yaw: jax.Array, dt: float) -> Command:
+    """The command `dt` seconds later; called at every step.
+
+    vx and vy approach the wanted ones. The yaw rate follows from the heading error (HG).
+    """
     error = maths.wrap_angle(command.heading - yaw)
     rate = jnp.clip(config.heading_gain * error, -config.max_yaw_rate, config.max_yaw_rate)
-    return with_velocity(config, command, command.velocity.at[2].set(rate))
+    return _approach(config, command, rate, dt)
 
 
 def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) -> Command:
-    """Returns the command with `velocity` [3] in place of its own.
+    """The command with the velocity [3] in place of its own; in the dead zone, vx and vy are zero.
 
-    vx and vy become zero in the dead zone. With `config.stand_still`, such a command means "stand"
-    (`moving` is False) unless it turns faster than `TURNING`.
+    With `config.acceleration` only the yaw rate changes at once. vx and vy are then the wanted
+    ones, and `steer` approaches them.
     """
     walks = maths.norm(velocity[:2]) > config.dead_zone
-    velocity = velocity * jnp.stack([walks, walks, jnp.ones((), bool)])
+    return _approach(config, command.replace(wanted=velocity[:2] * walks), velocity[2], 0.0)
+
+
+def _approach(config: CommandConfig, command: Command, rate: jax.Array, dt: float) -> Command:
+    """Moves vx and vy towards the wanted ones for `dt` seconds, and sets the yaw rate [rad/s].
+
+    With `config.stand_still`, a command of zero means "stand" (`moving` is False) unless it turns
+    faster than `TURNING`.
+    """
+    wanted = planar = command.wanted
+    if config.acceleration > 0:
+        way = wanted - command.velocity[:2]
+        share = config.acceleration * dt / jnp.maximum(maths.norm(way), 1e-6)
+        planar = command.velocity[:2] + way * jnp.minimum(share, 1.0)
+    velocity = jnp.append(planar, rate)
     if not config.stand_still:
         return command.replace(velocity=velocity, moving=jnp.ones((), bool))
-    moving = walks | (jnp.abs(velocity[2]) > TURNING)
+    moving = jnp.any(wanted != 0.0) | jnp.any(planar != 0.0) | (jnp.abs(rate) > TURNING)
     return command.replace(velocity=jnp.where(moving, velocity, 0.0), moving=moving)
 
 

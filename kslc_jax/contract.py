@@ -17,7 +17,7 @@ from kslc_jax import __version__, files
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
-METADATA_VERSION = 3
+METADATA_VERSION = 4
 """Version of `metadata`; it grows when a name or its meaning changes."""
 
 TRACE_SECONDS = 10.0
@@ -87,6 +87,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
         },
         "command": {
             "dead_zone": config.command.dead_zone,
+            "acceleration": config.command.acceleration,
             "heading_gain": config.command.heading_gain,
             "max_yaw_rate": config.command.max_yaw_rate,
             "stand_still": config.command.stand_still,

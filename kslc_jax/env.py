@@ -157,7 +157,7 @@ def step(
     new = maths.tree_where(broken, state.physics, new)
     now = signals.read(robot, new, state.dynamics.ground)
 
-    command = commands.steer(config.command, state.command, now.base_euler[2])
+    command = commands.steer(config.command, state.command, now.base_euler[2], config.control_dt)
     cycle = gait.cycle_time(config, command, curriculum.cycle_time, curriculum.v_max)
     gait_now = gait.update(config.gait, state.gait, now, command, cycle, config.control_dt)
 
@@ -260,9 +260,9 @@ def _sample_command(
     key: jax.Array,
     curriculum: Curriculum,
     now: Signals,
-    before: jax.Array | float = 0.0,
+    before: Command | None = None,
 ) -> Command:
-    """Draws a command from the curriculum's present range; `before` [m/s]: vx of the one before."""
+    """Draws a command from the curriculum's present range; `before` is the one that ends."""
     vx_range = (jnp.asarray(config.curriculum.v_min), curriculum.v_max)
     top_width = config.curriculum.v_step
     return commands.sample(config.command, key, vx_range, now.base_euler[2], top_width, before)
@@ -274,7 +274,7 @@ def _resample(
     """Draws a new command if the time of the old one is over."""
     key_command, key_time = jax.random.split(key)
     fresh = state.replace(
-        command=_sample_command(config, key_command, curriculum, now, state.command.velocity[0]),
+        command=_sample_command(config, key_command, curriculum, now, state.command),
         command_since=state.time,
         command_until=state.time
         + commands.holding_steps(config.command, key_time, config.control_dt),

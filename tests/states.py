@@ -69,7 +69,10 @@ def make_gait(**changes: Any) -> GaitState:
 
 def make_command(**changes: Any) -> Command:
     """Zero velocity; the clock runs."""
-    return _fill(Command, dict(velocity=np.zeros(3), heading=0.0, moving=True), changes)
+    start = dict(velocity=np.zeros(3), heading=0.0, moving=True, wanted=np.zeros(2))
+    if "velocity" in changes:
+        start["wanted"] = np.asarray(changes["velocity"])[:2]
+    return _fill(Command, start, changes)
 
 
 def joints(**values: float) -> np.ndarray:

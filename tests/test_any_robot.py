@@ -141,7 +141,7 @@ def test_too_little_of_the_trunk_is_an_error(biped):
 
 def command(vx: float) -> Command:
     velocity = jnp.array([vx, 0.0, 0.0])
-    return Command(velocity=velocity, heading=jnp.zeros(()), moving=jnp.ones((), bool))
+    return Command(velocity, jnp.zeros(()), jnp.ones((), bool), velocity[:2])
 
 
 def test_widths_follow_from_the_number_of_joints(biped, setup):

@@ -15,6 +15,7 @@ from kslc_jax.config import CommandConfig, preset
 
 PAPER = preset("paper").command
 KEY = jax.random.key(0)
+DT = 0.01
 
 
 def draw(vx=0.0, vy=0.0, heading=0.0, yaw=0.0, **changes):
@@ -23,7 +24,7 @@ def draw(vx=0.0, vy=0.0, heading=0.0, yaw=0.0, **changes):
     return commands.sample(config, KEY, (jnp.asarray(vx), jnp.asarray(vx)), jnp.asarray(yaw), 0.5)
 
 
-def draw_many(config: CommandConfig, n=4000, vx=(-0.3, 3.5), yaw=0.0, before=0.0):
+def draw_many(config: CommandConfig, n=4000, vx=(-0.3, 3.5), yaw=0.0, before=None):
     bounds, yaw = (jnp.asarray(vx[0]), jnp.asarray(vx[1])), jnp.asarray(yaw)
     sample = jax.vmap(lambda key: commands.sample(config, key, bounds, yaw, 0.5, before))
     return sample(jax.random.split(KEY, n))
@@ -59,7 +60,7 @@ def test_heading_error_becomes_a_yaw_rate(heading, yaw, rate):
     np.testing.assert_allclose(command.velocity, [1.0, 0.0, rate], atol=1e-6)
     assert float(command.heading) == pytest.approx(heading)
     # Again from the next yaw: nothing accumulates.
-    turned = jax.jit(lambda c, y: commands.steer(PAPER, c, y))(command, jnp.asarray(heading))
+    turned = jax.jit(lambda c, y: commands.steer(PAPER, c, y, DT))(command, jnp.asarray(heading))
     np.testing.assert_allclose(turned.velocity, [1.0, 0.0, 0.0], atol=1e-6)
 
 
@@ -67,7 +68,7 @@ def test_gain_and_limit_of_the_yaw_rate_are_the_configs():
     config = dataclasses.replace(PAPER, heading_gain=2.0, max_yaw_rate=0.7)
     command = make_command(velocity=[1.0, 0.0, 0.0], heading=0.3)
     for yaw, rate in ((0.0, 0.6), (-0.1, 0.7), (0.4, -0.2)):
-        got = commands.steer(config, command, jnp.asarray(yaw)).velocity[2]
+        got = commands.steer(config, command, jnp.asarray(yaw), DT).velocity[2]
         assert float(got) == pytest.approx(rate, abs=1e-6)
 
 
@@ -151,12 +152,41 @@ def test_fast_commands_are_followed_by_stops_and_reversals(before, share):
     """Of those above half of the range, 3.5 m/s, two fifths: half stand, half go back at -0.3 m/s.
     They go straight."""
     config = dataclasses.replace(PAPER, dead_zone=0.0, brake_fraction=0.4)
-    drawn = draw_many(config, before=before)
+    drawn = draw_many(config, before=make_command(velocity=[before, 0.0, 0.0]))
     vx, vy, _ = np.asarray(drawn.velocity).T
     stops, reversals = vx == 0.0, vx == np.float32(-0.3)
     assert stops.mean() == pytest.approx(share / 2, abs=0.03)
     assert reversals.mean() == pytest.approx(share / 2, abs=0.03)
     assert not vy[stops | reversals].any()
+
+
+def test_the_command_approaches_the_wanted_one():
+    """At 4 m/s^2 for 0.01 s a step: 0.04 m/s, straight towards (3, 4) / 10, which takes 12.5."""
+    config = dataclasses.replace(PAPER, acceleration=4.0, stand_still=True)
+    steer = jax.jit(lambda c: commands.steer(config, c, jnp.zeros(()), DT))
+    start = commands.standing(jnp.zeros(()))
+    command = commands.with_velocity(config, start, jnp.array([0.3, 0.4, 0.0]))
+    assert command.velocity.tolist() == [0.0, 0.0, 0.0] and bool(command.moving)
+    for step in range(1, 16):
+        command = steer(command)
+        part = min(0.04 * step, 0.5)
+        np.testing.assert_allclose(command.velocity, [0.6 * part, 0.8 * part, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(command.velocity[:2], command.wanted)
+    # The robot stands when the command is zero, not when zero is wanted.
+    command = commands.with_velocity(config, command, jnp.zeros(3))
+    for step in range(13):
+        assert bool(command.moving), step
+        command = steer(command)
+    assert not bool(command.moving) and not command.velocity.any()
+
+
+def test_a_new_command_starts_from_the_one_before():
+    config = dataclasses.replace(PAPER, acceleration=4.0, vy=(0.2, 0.2))
+    before = make_command(velocity=[3.0, 0.0, 0.0])
+    vx = jnp.asarray(1.0)
+    command = commands.sample(config, KEY, (vx, vx), jnp.zeros(()), 0.5, before)
+    assert command.velocity[:2].tolist() == [3.0, 0.0]
+    np.testing.assert_allclose(command.wanted, [1.0, 0.2])
 
 
 @pytest.mark.parametrize(
@@ -189,11 +219,11 @@ def test_a_standing_robot_that_drifts_turns_back():
     """A heading error of 0.3 rad commands 0.5 * 0.3 rad/s, which is more than 0.1 rad/s."""
     config = dataclasses.replace(PAPER, stand_still=True)
     command = make_command(heading=0.0, moving=False)
-    assert not bool(commands.steer(config, command, jnp.asarray(0.19)).moving)
-    drifted = commands.steer(config, command, jnp.asarray(0.3))
+    assert not bool(commands.steer(config, command, jnp.asarray(0.19), DT).moving)
+    drifted = commands.steer(config, command, jnp.asarray(0.3), DT)
     assert bool(drifted.moving)
     np.testing.assert_allclose(drifted.velocity, [0.0, 0.0, -0.15], atol=1e-6)
-    assert not bool(commands.steer(config, drifted, jnp.asarray(0.1)).moving)
+    assert not bool(commands.steer(config, drifted, jnp.asarray(0.1), DT).moving)
 
 
 def test_fractions_and_ranges():

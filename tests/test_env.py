@@ -157,10 +157,13 @@ def test_a_command_holds_until_its_time_is_over(setting):
     config, reset, step = setting
     robot = physics.robot_for(config.physics)
     state = reset(jax.random.key(3)).replace(command_until=jnp.int32(800))
-    command = state.command.velocity[:2]
+    wanted = state.command.wanted
     for time, changes in ((798, False), (799, True)):
         new, outcome = step(state.replace(time=jnp.int32(time)), jnp.zeros(16), jax.random.key(4))
-        assert bool(jnp.any(new.command.velocity[:2] != command)) == changes
+        assert bool(jnp.any(new.command.wanted != wanted)) == changes
+        # 0.01 s at 4 m/s^2 towards the old command, in either case
+        command = 0.04 * wanted / jnp.linalg.norm(wanted)
+        np.testing.assert_allclose(new.command.velocity[:2], command, rtol=1e-5)
         error = signals.read(robot, new.physics).base_linvel[:2] - command
         expected = jnp.exp(-config.rewards.tracking_sigma * jnp.sum(error**2))
         assert float(outcome.terms["tracking_lin_vel"]) == pytest.approx(float(expected), rel=1e-5)
@@ -196,7 +199,7 @@ def test_a_robot_brakes_for_four_seconds_after_its_last_command_at_the_top(setti
 
     def stepped(state, vx, time):
         velocity = jnp.array([vx, 0.0, 0.0])
-        command = state.command.replace(velocity=velocity)
+        command = state.command.replace(velocity=velocity, wanted=velocity[:2])
         now = state.replace(command=command, time=jnp.int32(time))
         return step(now, jnp.zeros(16), jax.random.key(4))
 
@@ -294,7 +297,7 @@ def test_the_engine_steps_the_robot_of_the_episode(setting):
 def test_commands_come_from_the_curriculums_range(setting):
     config, _, _ = setting
     cur = curriculum.init(config).replace(v_max=jnp.asarray(1.5))
-    draw = jax.jit(jax.vmap(lambda key: env.reset(config, key, cur).command.velocity[0]))
+    draw = jax.jit(jax.vmap(lambda key: env.reset(config, key, cur).command.wanted[0]))
     vx = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)))
     assert vx.min() < -0.28 and 1.45 < vx.max() <= 1.5
 

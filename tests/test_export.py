@@ -141,7 +141,7 @@ def test_the_graph_estimates_the_velocity_and_then_acts(policy, onnx_file):
 def test_metadata(symmetric, xbot):
     """The numbers are typed by hand where the paper or Humanoid-Gym gives them."""
     data = contract.metadata(symmetric)
-    assert data["metadata_version"] == 3 and data["train_step"] == 7
+    assert data["metadata_version"] == 4 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
     assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
     assert data["effort_limit"][3] == 212.5
@@ -302,7 +302,7 @@ def trajectory(policy):
 def controller_of(runner, path, states, i):
     """A controller of the runner with command and phase of the start of environment `i`."""
     command = states.command
-    vx, vy, _ = command.velocity[0, i].tolist()
+    vx, vy = command.wanted[0, i].tolist()
     controller = runner.Controller(path, vx, vy, command.heading[0, i])
     controller.phase = float(states.gait.phase[0, i])
     return controller

@@ -166,7 +166,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
         time=time,
         history=jax.random.normal(jax.random.key(1), old.history.shape),
         privileged_history=jax.random.normal(jax.random.key(2), old.privileged_history.shape),
-        command=old.command.replace(velocity=vx),
+        command=old.command.replace(velocity=vx, wanted=vx[:, :2]),
         physics=old.physics.replace(qvel=old.physics.qvel.at[-1, 8].set(jnp.nan)),
     )
     new, got = jax.jit(lambda s: train_step.step(config, s))(state.replace(env=old))

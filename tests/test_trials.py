@@ -62,7 +62,7 @@ def test_a_yaw_rate_never_turns_the_other_way(still, rate):
     """A rate of 3 rad/s would ask for a heading 6 rad ahead, which is 0.28 rad behind."""
     state = env.reset(still.config, jax.random.key(1), still.curriculum)
     held = trials.with_command(still.config, state, jnp.array([0.0, 0.0, rate]))
-    steered = commands.steer(still.config.command, held.command, jnp.zeros(()))
+    steered = commands.steer(still.config.command, held.command, jnp.zeros(()), 0.01)
     assert float(steered.velocity[2]) == pytest.approx(np.clip(rate, -1.0, 1.0), abs=1e-5)
 
 

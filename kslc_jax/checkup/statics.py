@@ -140,7 +140,9 @@ def unfelt(train: Robot, high: Robot) -> tuple[int, int]:
 def reference(config: Config, robot: Robot, speed: float, phases: np.ndarray) -> np.ndarray:
     """Reference angles [..., n, rad] from home at a commanded speed [m/s] and phases [...] in
     [0, 1)."""
-    command = commands.Command(jnp.array([speed, 0.0, 0.0]), jnp.zeros(()), jnp.ones((), bool))
+    command = commands.standing(jnp.zeros(())).replace(
+        velocity=jnp.array([speed, 0.0, 0.0]), moving=jnp.ones((), bool)
+    )
     start = gait.init(config.gait, jax.random.key(0), command, jnp.zeros(2))
 
     def one(angle: jax.Array) -> jax.Array:

@@ -8,32 +8,27 @@ paper builds on it, and it decides what the paper leaves open. docs/fidelity.md 
 departure from them.
 """
 
-from kslc_jax.config.options import options
-from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
-from kslc_jax.config.schema import (
-    COUNTER,
-    GROUNDS,
+from kslc_jax.config.checks import COUNTER, ConfigError, Range, require_seed
+from kslc_jax.config.env import (
     MOST_INSET,
-    XBOT_L,
     CommandConfig,
-    Config,
-    ConfigError,
-    CurriculumConfig,
     EnvConfig,
-    Fidelity,
     GaitConfig,
-    HighFidelity,
-    NetworkConfig,
-    PhysicsConfig,
-    PPOConfig,
     RandomizeConfig,
-    Range,
-    RewardConfig,
-    RewardWeights,
-    RunConfig,
-    TerrainConfig,
-    require_seed,
 )
+from kslc_jax.config.learning import CurriculumConfig, NetworkConfig, PPOConfig, RunConfig
+from kslc_jax.config.options import options
+from kslc_jax.config.physics import (
+    GROUNDS,
+    XBOT_L,
+    Fidelity,
+    HighFidelity,
+    PhysicsConfig,
+    TerrainConfig,
+)
+from kslc_jax.config.presets import ABLATIONS, PRESETS, preset
+from kslc_jax.config.rewards import RewardConfig, RewardWeights
+from kslc_jax.config.schema import Config
 from kslc_jax.config.storage import (
     ROBOT_FOLDER,
     SCHEMA_VERSION,

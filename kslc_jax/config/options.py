@@ -4,8 +4,9 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+from kslc_jax.config.physics import XBOT_L
 from kslc_jax.config.presets import PRESETS
-from kslc_jax.config.schema import XBOT_L, Config
+from kslc_jax.config.schema import Config
 
 
 def options(config: Config, presets: Mapping[str, Config] = PRESETS) -> list[str]:

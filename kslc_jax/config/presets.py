@@ -4,7 +4,8 @@ import dataclasses
 import difflib
 from typing import Any
 
-from kslc_jax.config.schema import Config, ConfigError
+from kslc_jax.config.checks import ConfigError
+from kslc_jax.config.schema import Config
 
 
 def _override(config: Any, **changes: Any) -> Any:
@@ -54,6 +55,7 @@ _LAPTOP = _override(
     ppo={"entropy_fades": True, "average": 0.98},
     command={
         "shortest_seconds": 1.0,
+        "acceleration": 4.0,
         "stand_fraction": 0.15,
         "forward_fraction": 0.2,
         "slow_fraction": 0.15,

@@ -6,7 +6,8 @@ import typing
 from pathlib import Path
 from typing import Any, Literal
 
-from kslc_jax.config.schema import Config, require
+from kslc_jax.config.checks import require
+from kslc_jax.config.schema import Config
 
 SCHEMA_VERSION = 1
 

@@ -249,7 +249,7 @@ def _drawn(schedule: Schedule, config: CommandConfig, leg: Leg, key, yaw: jax.Ar
     sampled = commands.sample(config, keys[0], (low, top), yaw, schedule.top_width)
     reverses = jax.random.bernoulli(keys[1], REVERSALS)
     straight = jnp.where(fast, top, jnp.where(reverses, low, 0.0)) * jnp.array([1.0, 0.0, 0.0])
-    drawn = sampled.velocity.at[2].set(0.0)  # the heading alone decides the turn
+    drawn = jnp.append(sampled.wanted, 0.0)  # the heading alone decides the turn
     special = fast | brakes
     seconds = jax.random.uniform(keys[2], minval=shortest, maxval=longest)
     return leg.replace(

@@ -88,7 +88,7 @@ class Trace:
     contact: jax.Array  # [2] bool, left and right foot
     foot_height: jax.Array  # [2] m, ankle-roll link above the ground
     angular_momentum: jax.Array  # [3] kg m^2/s about the whole-body CoM, world
-    command: jax.Array  # [3] vx, vy [m/s], yaw rate [rad/s] during the step
+    command: jax.Array  # [3] wanted vx, vy [m/s], and the yaw rate [rad/s] during the step
     leg: jax.Array  # int, number of the schedule's leg
     ground: Ground | None = None  # uneven ground; None: the flat floor
 
@@ -146,12 +146,11 @@ def without_joint_noise(config: Config) -> Config:
 
 def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> env.EnvState:
     """A reset environment whose first frame shows the command [3]: vx, vy [m/s], heading [rad]."""
-    wanted = commands.Command(
-        velocity=jnp.append(command[:2], 0.0), heading=command[2], moving=jnp.zeros((), bool)
-    )
+    still = commands.standing(command[2])
+    wanted = commands.with_velocity(config.command, still, jnp.append(command[:2], 0.0))
     robot = physics.robot_for(config.physics)
     yaw = signals.read(robot, state.physics).base_euler[2]
-    steered = commands.steer(config.command, wanted, yaw)
+    steered = commands.steer(config.command, wanted, yaw, 0.0)
     clock, stance = gait.clock_of(config.gait, state.gait.phase, steered)
     state = state.replace(
         command=steered,
@@ -288,7 +287,8 @@ def _advance(
     )
     mass = randomize.total_mass(robot, after.dynamics)
     mass += len(robot.hand_body_ids) * setting.variation.hands
-    return trial, _record(robot, trial, state.command.velocity, mass)
+    wanted = jnp.append(state.command.wanted, state.command.velocity[2])
+    return trial, _record(robot, trial, wanted, mass)
 
 
 def _simulator(setting: Setting, robot: Robot, body: Body, key: jax.Array):
