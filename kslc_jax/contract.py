@@ -131,9 +131,6 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     second = np.arange(len(SHARES)) == 1
     commands = np.stack([speeds, SIDEWAYS * second, HEADING * second], axis=1).astype(np.float32)
 
-    def start(command: jax.Array, key: jax.Array) -> env.EnvState:
-        return trials.facing_command(config, env.reset(config, key, policy.curriculum), command)
-
     def one(carry: tuple[env.EnvState, jax.Array], _: None):
         state, alive = carry
         before = state.physics
@@ -152,14 +149,14 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
         return (new, alive), jax.tree.map(lambda x: jnp.where(alive, x, jnp.nan), row)
 
     def trial(command: jax.Array, key: jax.Array):
-        state = start(command, key)
+        state = env.reset(config, key, policy.curriculum)
+        state = trials.facing_command(config, state, command)
         steps = round(seconds / config.control_dt)
         (_, _), rows = jax.lax.scan(one, (state, jnp.ones((), bool)), None, steps)
         return state.gait.phase, rows
 
-    phase, rows = jax.jit(jax.vmap(trial))(
-        commands, jax.random.split(jax.random.key(0), len(SHARES))
-    )
+    keys = jax.random.split(jax.random.key(0), len(SHARES))
+    phase, rows = jax.jit(jax.vmap(trial))(commands, keys)
     rows = jax.tree.map(np.asarray, rows)
     steps = np.isfinite(rows["target"]).all(axis=-1).sum(axis=1)
     return {"command": commands, "phase": np.asarray(phase), "steps": steps, **rows}

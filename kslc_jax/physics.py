@@ -307,25 +307,41 @@ def _host_step(
         for name, value in fields.items():
             batch.expand(name)[:] = value
         qpos, qvel, warmstart = (batch.bind(n) for n in ("qpos", "qvel", "qacc_warmstart"))
-        sensordata, ctrl = batch.bind("sensordata"), batch.bind("ctrl")
-        servos = batch.expand("actuator_biasprm")
         qpos[:], qvel[:], warmstart[:] = state.qpos, state.qvel, state.qacc_warmstart
-        torque = state.torque
-        for i in range(config.decimation):
-            torque, ctrl[:], servos[:, :, SERVO_DAMPING] = drive(
-                robot, dynamics, qpos[:, 7:], qvel[:, 6:], target, np
-            )
-            for name, value in moved.items():
-                batch.expand(name)[:, robot.ground_geom_ids] = value[:, i]
-            last = i == config.decimation - 1
-            batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
+        torque = _physics_steps(config, robot, batch, target, dynamics, moved, state.torque)
         new = state.replace(
             qpos=qpos,
             qvel=qvel,
             qacc_warmstart=warmstart,
-            sensordata=sensordata,
+            sensordata=batch.bind("sensordata"),
             torque=torque,
         )
         return jax.tree.map(
             lambda x, old: np.array(x, old.dtype).reshape(*lead, *x.shape[1:]), new, like
         )
+
+
+def _physics_steps(
+    config: PhysicsConfig,
+    robot: Robot,
+    batch: mujoco.batch.Batch,
+    target: np.ndarray,
+    dynamics: Dynamics,
+    moved: dict[str, np.ndarray],
+    torque: np.ndarray,
+) -> np.ndarray:
+    """The physics steps of one control step, in place; returns the last torque [N, n, N m].
+
+    `moved` has a value [N, physics step, plane, ...] for each field of the ground's planes.
+    """
+    qpos, qvel, ctrl = batch.bind("qpos"), batch.bind("qvel"), batch.bind("ctrl")
+    servos = batch.expand("actuator_biasprm")
+    for i in range(config.decimation):
+        torque, ctrl[:], servos[:, :, SERVO_DAMPING] = drive(
+            robot, dynamics, qpos[:, 7:], qvel[:, 6:], target, np
+        )
+        for name, value in moved.items():
+            batch.expand(name)[:, robot.ground_geom_ids] = value[:, i]
+        last = i == config.decimation - 1
+        batch.step(stage=int(mujoco.mjtStage.mjSTAGE_VEL if last else 0))
+    return torque

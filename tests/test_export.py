@@ -417,7 +417,7 @@ def test_the_runner_walks_on_at_the_edge_of_the_dead_zone(runner, onnx_file):
     seen = []
     for vx in (0.21, 0.19, -0.181, 0.179, 0.19):
         controller.command(vx)
-        seen.append(round(float(controller.velocity[0]), 3))
+        seen.append(round(float(controller.wanted[0]), 3))
     assert seen == [0.21, 0.2, -0.2, 0.0, 0.0]
 
 

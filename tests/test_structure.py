@@ -112,3 +112,56 @@ def test_no_training_is_loaded_with_judging_and_looking():
 def test_configs_and_commands_load_no_jax():
     for name, loaded in loaded_by(*(f"kslc_jax.{name}" for name in LIGHT)).items():
         assert not {"jax", "mujoco", "orbax"} & loaded, name
+
+
+MOST_OF_BODY, MOST_OF_MODULE = 40, 300
+"""Lines of code in a function's body, and in a module (CONTRIBUTING.md)."""
+
+LONG = 8
+"""A list, table or call with so many parts counts as one line: it is read like a table."""
+
+
+def lines_of_code(statements: list[ast.stmt]) -> int:
+    """Number of lines without docstrings, comments and empty lines; long lists count once."""
+    lines, spared = set(), set()
+    for node in (x for statement in statements for x in ast.walk(statement)):
+        first, last = getattr(node, "lineno", 0), getattr(node, "end_lineno", 0)
+        match node:
+            case ast.Expr(value=ast.Constant(value=str())):
+                spared |= set(range(first, last + 1))
+            case ast.Dict(keys=parts) | ast.List(elts=parts) | ast.Tuple(elts=parts):
+                spared |= set(range(first + 1, last + 1)) if len(parts) >= LONG else set()
+            case ast.Call():
+                parts = [*node.args, *node.keywords]
+                spared |= set(range(first + 1, last + 1)) if len(parts) >= LONG else set()
+        if isinstance(node, ast.expr | ast.arg | ast.stmt | ast.keyword):
+            lines |= {first, last}
+    return len(lines - spared)
+
+
+def test_lines_of_code():
+    text = '''
+def f(a):
+    """One
+    two."""
+    # a comment
+    b = [1, 2,
+
+         3]
+    return dict(
+        a=1, b=2, c=3, d=4,
+        e=5, f=6, g=7, h=8,
+    )
+'''
+    (function,) = ast.parse(text).body
+    assert isinstance(function, ast.FunctionDef)
+    assert lines_of_code(function.body) == 3
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_functions_and_modules_are_short(name):
+    tree = ast.parse(MODULES[name].read_text())
+    assert lines_of_code(tree.body) <= MOST_OF_MODULE
+    functions = [x for x in ast.walk(tree) if isinstance(x, ast.FunctionDef)]
+    long = {f.name: n for f in functions if (n := lines_of_code(f.body)) > MOST_OF_BODY}
+    assert not long

@@ -31,20 +31,7 @@ class Config:
     def __post_init__(self):
         check_numbers("", self)
         require_seed(self.seed)
-        for name, seconds in (
-            ("env.episode_seconds", self.env.episode_seconds),
-            ("command.resample_seconds", self.command.resample_seconds),
-            (
-                "command.shortest_seconds",
-                self.command.shortest_seconds or self.command.resample_seconds,
-            ),
-            ("randomize.push_seconds", self.randomize.push_seconds or self.control_dt),
-        ):
-            steps = seconds / self.control_dt
-            require(
-                0.5 < steps < COUNTER,
-                f"{name}: {seconds} s are {steps:.2g} control steps; 1 to 2^31 are allowed",
-            )
+        self._check_durations()
         require(
             self.batch_size < COUNTER,
             f"env.num_envs x ppo.rollout_steps: {self.batch_size} samples, the limit is 2^31",
@@ -74,6 +61,21 @@ class Config:
             f"ppo.minibatches: {self.ppo.minibatches} does not divide the batch of "
             f"{self.env.num_envs} envs x {self.ppo.rollout_steps} steps",
         )
+
+    def _check_durations(self) -> None:
+        """Raises ConfigError for a duration that is no number of control steps which fits."""
+        for name, seconds in {
+            "env.episode_seconds": self.env.episode_seconds,
+            "command.resample_seconds": self.command.resample_seconds,
+            "command.shortest_seconds": self.command.shortest_seconds
+            or self.command.resample_seconds,
+            "randomize.push_seconds": self.randomize.push_seconds or self.control_dt,
+        }.items():
+            steps = seconds / self.control_dt
+            require(
+                0.5 < steps < COUNTER,
+                f"{name}: {seconds} s are {steps:.2g} control steps; 1 to 2^31 are allowed",
+            )
 
     @property
     def batch_size(self) -> int:

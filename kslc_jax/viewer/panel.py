@@ -94,17 +94,8 @@ class Panel:
                 gui.add_slider("yaw rad/s", -turn, turn, 0.05, 0.0),
             )
             buttons = gui.add_button_group("", ("Stop", "Pause", "Reset"))
-        with gui.add_folder("Shove"):
-            self._link = gui.add_dropdown("link", tuple(links), initial_value=links[0])
-            self._direction = gui.add_dropdown(
-                "towards", (*DIRECTIONS, RANDOM), initial_value=RANDOM
-            )
-            self._newtons = gui.add_slider("force N", 50.0, MOST_NEWTONS, 50.0, 200.0)
-            shove = gui.add_button("Shove")
-        with gui.add_folder("Show"):
-            self.follow = gui.add_checkbox("Follow", True)
-            self.rate = gui.add_dropdown("Playback", tuple(RATES), initial_value="1x")
-            self.policy = gui.add_dropdown("Policy", tuple(names), initial_value=names[0])
+        self._add_shove(links)
+        self._add_show(names)
         self._plots = _plots(gui)
         with gui.add_folder("Keys", expand_by_default=False):
             gui.add_markdown(HELP)
@@ -115,13 +106,31 @@ class Panel:
             "Stop": self._stop,
         }
         buttons.on_click(lambda event: actions[event.target.value]())
-        shove.on_click(lambda _: self._shove_wanted.set())
         for slider in self._sliders:
             slider.on_update(self._moved)
         for key, label in ACTIONS.items():
             _bind(gui, key, label, actions[label])
         for key, (label, way) in WAYS.items():
             _bind(gui, key, label, lambda way=way: self._change(STEP * way))
+
+    def _add_shove(self, links: Sequence[str]) -> None:
+        """The folder in which the user chooses a force on a link."""
+        gui = self._gui
+        with gui.add_folder("Shove"):
+            self._link = gui.add_dropdown("link", tuple(links), initial_value=links[0])
+            towards = (*DIRECTIONS, RANDOM)
+            self._direction = gui.add_dropdown("towards", towards, initial_value=RANDOM)
+            self._newtons = gui.add_slider("force N", 50.0, MOST_NEWTONS, 50.0, 200.0)
+            shove = gui.add_button("Shove")
+            shove.on_click(lambda _: self._shove_wanted.set())
+
+    def _add_show(self, names: Sequence[str]) -> None:
+        """The folder of what the page shows."""
+        gui = self._gui
+        with gui.add_folder("Show"):
+            self.follow = gui.add_checkbox("Follow", True)
+            self.rate = gui.add_dropdown("Playback", tuple(RATES), initial_value="1x")
+            self.policy = gui.add_dropdown("Policy", tuple(names), initial_value=names[0])
 
     def _pause(self) -> None:
         self.paused = not self.paused
