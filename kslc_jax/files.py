@@ -92,7 +92,7 @@ def _is_device(path: Path) -> bool:
 
 
 def _part(target: Path) -> Path:
-    """Where the new content of a file waits; it has the same suffix."""
+    """Path of the unfinished new content of a file. It has the same suffix."""
     return target.with_name(f".{target.stem}.part{target.suffix}")
 
 

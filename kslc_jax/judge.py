@@ -3,7 +3,8 @@
 A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fidelity: at each
 commanded speed, under random changes of the command from four starting headings (16 robots whose
 masses, motors and friction differ), and with each perturbation of sim2sim. A robot of another size
-than XBot-L gets other speeds and perturbations, by dynamic similarity. Prints one table: each bar,
+than XBot-L gets other speeds and perturbations, by dynamic similarity. --harsh adds shoves, arms
+that somebody else moves, and uneven ground. Prints one table: each bar,
 its required value, the worst measured value, and the condition of that value. The exit code is 0
 even if the policy misses a bar. docs/sim2sim.md describes the measurements.
 
@@ -12,7 +13,7 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 Examples:
   python -m kslc_jax.judge xbot_l_run --quick
   python -m kslc_jax.judge runs/laptop-seed0 --json judged.json
-  python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --drake
+  python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --harsh --drake
 """
 
 import contextlib
@@ -64,6 +65,8 @@ class Size:
     perturbed_speeds: tuple[float, ...]
     perturbed_seeds: int
     perturbed_seconds: float
+    harsh_seeds: int
+    harsh_seconds: float
     top: float = TOP  # fastest speed that Drake tries
 
     def for_robot(self, robot: "Robot") -> "Size":
@@ -85,7 +88,7 @@ class Size:
         )
 
 
-FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, PERTURBED_TOP), 4, 20.0)
+FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, PERTURBED_TOP), 4, 20.0, 32, 30.0)
 QUICK = Size(
     (0.0, 0.5, 2.0, 3.5, 4.0),
     2,
@@ -96,6 +99,8 @@ QUICK = Size(
     ("push=0.5",),
     (PERTURBED_TOP,),
     2,
+    8.0,
+    4,
     8.0,
 )
 
@@ -112,6 +117,9 @@ class Args:
     """Trials per speed; None: 4, with --quick 2."""
     seconds: float | None = None
     """Length of the trials at constant speeds [s]; None: 60, with --quick 15."""
+    harsh: bool = False
+    """Also try the policy under shoves of 300 N, with arms that follow random targets, and on
+    uneven ground."""
     drake: bool = False
     """Also try the policy in Drake. This is slow, and needs the package drake."""
     seed: int = 0
@@ -145,7 +153,7 @@ def measure(
     """Measures everything that `bars` reads. Calls `keep` with the results after each part."""
     found: Results = {}
     for name, part in PARTS.items():
-        if name != "drake" or args.drake:
+        if name not in ("harsh", "drake") or getattr(args, name):
             found[name] = part(size, args, policy, progress)
             keep(found)
     return found
@@ -201,24 +209,57 @@ def _schedules(
 def _perturbed(
     size: Size, args: Args, policy, progress: Progress
 ) -> dict[str, list[dict[str, float]]]:
+    found = {}
+    for i, condition in enumerate(size.perturbations):
+
+        def told(share: float, i: int = i) -> None:
+            progress("perturbed", (i + share) / len(size.perturbations))
+
+        trial = condition, size.perturbed_speeds, size.perturbed_seeds, size.perturbed_seconds
+        found[condition] = _tried(args, policy, *trial, told)
+    return found
+
+
+def _harsh(size: Size, args: Args, policy, progress: Progress) -> dict[str, dict[str, Any]]:
+    """The wanted share and the rows of each condition of `bars.HARSH` that the robot can have."""
+    from kslc_jax import physics, similar
+    from kslc_jax.evaluation import variation
+
+    robot = physics.robot_for(policy.config.physics)
+    factor, found = similar.factors(robot)[SPEED], {}
+    for i, (condition, (wanted, speeds)) in enumerate(bars_lib.HARSH.items()):
+
+        def told(share: float, i: int = i) -> None:
+            progress("harsh", (i + share) / len(bars_lib.HARSH))
+
+        own = tuple(bars_lib.scaled(speed, factor) for speed in speeds)
+        for name in variation.for_robot([condition], robot):
+            trial = name, own, size.harsh_seeds, size.harsh_seconds
+            found[name] = {"wanted": wanted, "rows": _tried(args, policy, *trial, told)}
+    return found
+
+
+def _tried(
+    args: Args,
+    policy,
+    condition: str,
+    speeds: tuple[float, ...],
+    seeds: int,
+    seconds: float,
+    told: Callable[[float], None],
+) -> list[dict[str, float]]:
+    """Survival and mean speed at each commanded speed [m/s] under one condition."""
     from kslc_jax.evaluation import gait_metrics, trials
     from kslc_jax.evaluation.measure import measure as measured
 
     def speed(trace, command: float, robot, dt: float) -> dict[str, float]:
         return gait_metrics.speed(trace, command, dt)
 
-    found = {}
-    plain = trials.Setting(trials.engine(policy, "high"), seconds=size.perturbed_seconds)
-    for i, condition in enumerate(size.perturbations):
-
-        def told(share: float, i: int = i) -> None:
-            progress("perturbed", (i + share) / len(size.perturbations))
-
-        setting = dataclasses.replace(plain, **settings(changes(condition), plain.randomize))
-        found[condition] = measured(
-            policy, setting, size.perturbed_speeds, size.perturbed_seeds, args.seed, told, speed
-        )
-    return found
+    made = changes(condition)
+    engine = trials.engine(policy, "high", made.pop("terrain", None))
+    plain = trials.Setting(engine, seconds=seconds)
+    setting = dataclasses.replace(plain, **settings(made, plain.randomize))
+    return measured(policy, setting, speeds, seeds, args.seed, told, speed)
 
 
 def _drake(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
@@ -233,7 +274,13 @@ def _drake(size: Size, args: Args, policy, progress: Progress) -> list[dict[str,
     return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
 
 
-PARTS = {"speeds": _speeds, "schedules": _schedules, "perturbed": _perturbed, "drake": _drake}
+PARTS = {
+    "speeds": _speeds,
+    "schedules": _schedules,
+    "perturbed": _perturbed,
+    "harsh": _harsh,
+    "drake": _drake,
+}
 """Parts of the measurement, in their order."""
 
 
@@ -286,7 +333,8 @@ def _report(args: Args) -> None:
     screen = tables.console()
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in PARTS}
-        bar.update(tasks["drake"], visible=args.drake)
+        for name in ("harsh", "drake"):
+            bar.update(tasks[name], visible=getattr(args, name))
 
         def progress(name: str, share: float) -> None:
             bar.start_task(tasks[name])

@@ -64,7 +64,7 @@ MOST_LATENCY = 50
 """Largest delay of the actions [control steps]."""
 
 
-MUJOCO_ONLY = ("variation", "terrain")
+MUJOCO_ONLY = ("variation", "terrain", "punch")
 """Changes of `perturbations.changes` that Drake does not have."""
 
 
@@ -115,8 +115,9 @@ class Args:
     every 4 s), gains=FACTOR on kp and kd, strength=FACTOR on the motors' torque, imu=RAD (constant
     error of roll and pitch), links=SHARE (largest change of each link's mass), hands=KG at each
     hand, sole=M (largest distance of a sole's sides from the foot's outline), joints=X (each joint
-    gets up to X N m more friction and X N m s/rad more damping), heading=RAD at the start; all:
-    sixteen of these, with values that fit the robot's size."""
+    gets up to X N m more friction and X N m s/rad more damping), punch=NEWTONS, arms=1 (as
+    --hold-arms), heading=RAD at the start; all: sixteen of these, with values that fit the robot's
+    size."""
     seed: int = 0
     """Seed of the initial states."""
     json: Path | None = None

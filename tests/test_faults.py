@@ -411,7 +411,7 @@ class TestBrokenSamples:
 
 
 class TestAround:
-    """Where a training runs makes no difference to it."""
+    """A training survives closed outputs and signals, and runs in threads and notebook cells."""
 
     @staticmethod
     def closed_output(monkeypatch):
@@ -516,7 +516,7 @@ class TestAround:
 
 
 def files_of(folder):
-    """What every file of a folder holds, locks apart."""
+    """The content of every file of a folder, without locks."""
     return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != ".lock"}
 
 
@@ -530,7 +530,7 @@ def finished(counting, tmp_path_factory):
 
 
 class TestResume:
-    """What --resume says, and what it keeps."""
+    """The messages of --resume, and the files that it keeps."""
 
     @pytest.fixture
     def done(self, finished, training, capsys):
@@ -570,7 +570,7 @@ class TestResume:
         ],
     )
     def test_another_config_names_the_command(self, change, says, done, monkeypatch):
-        """What is to be typed gives the config that was asked for."""
+        """The command in the message gives the config that was asked for."""
         before = files_of(done.dir)
         line = done(*change, code=2)
         assert says in line and len(line.splitlines()) == 1

@@ -2,14 +2,15 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 
 from kslc_jax import judge, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.evaluation import measure as measuring
-from kslc_jax.evaluation import scheduled
-from kslc_jax.evaluation.bars import bars
+from kslc_jax.evaluation import scheduled, variation
+from kslc_jax.evaluation.bars import HARSH, bars
 
 
 def row(command, **changes):
@@ -40,7 +41,7 @@ def good():
 
 
 def test_a_good_policy_meets_all_bars():
-    """What happens at 4.5 m/s is no bar."""
+    """The row of 4.5 m/s is only reported."""
     found = bars(good())
     assert len(found) == 12 and all(bar.met for bar in found)
 
@@ -81,6 +82,49 @@ def test_drake_is_a_bar_where_it_was_tried():
     results = good() | {"drake": [row(1.0, survival=0.0)]}
     (missed,) = [bar for bar in bars(results) if not bar.met]
     assert missed.name.startswith("nobody falls, Drake")
+
+
+def test_harsh_conditions_are_bars_where_they_were_tried():
+    """Each has its own share that must survive."""
+    rows = [row(0.0), row(1.0, survival=0.96)]
+    parts = {"punch=300": {"wanted": 0.95, "rows": rows}, "arms=1": {"wanted": 1.0, "rows": rows}}
+    found = bars(good() | {"harsh": parts})
+    assert len(found) == 14
+    (missed,) = [bar for bar in found if not bar.met]
+    assert missed.name == "share that does not fall, arms=1" and missed.value == 0.96
+    assert missed.where == "1 m/s"
+
+
+def test_harsh_conditions_are_tried_as_named(monkeypatch):
+    seen = []
+
+    def measure(policy, setting, speeds, seeds, seed, progress, describe):
+        seen.append((setting, tuple(speeds), seeds))
+        return [row(speed) for speed in speeds]
+
+    monkeypatch.setattr(measuring, "measure", measure)
+    policy = policy_lib.load_policy("xbot_l_run")
+    args = judge.Args(Path("p"), harsh=True)
+    found = judge._harsh(judge.FULL, args, policy, lambda name, share: None)
+    assert [name for name in found] == list(HARSH) and found["punch=300"]["wanted"] == 0.95
+    punched, held, rough, waves, slope = (setting for setting, _, _ in seen)
+    assert punched.randomize.punch == (300, 300) and punched.seconds == 30
+    assert held.randomize.held_arms == 1 and not held.physics.terrain.kinds
+    assert rough.physics.terrain.rough == 0.05 and slope.physics.terrain.slope == 10
+    assert seen[3][1:] == ((3.0,), 32) and waves.physics.terrain.rough == 0.03
+
+
+def test_harsh_conditions_fit_the_size_of_the_robot():
+    """A force scales with the mass, a height with the length; without arms nobody moves them."""
+    xbot = robot.load()
+    assert variation.for_robot(list(HARSH), xbot) == tuple(HARSH)
+    small = dataclasses.replace(xbot, length_ratio=0.25, mass_ratio=0.5)
+    own = ("punch=150", "arms=1", "rough:0.013", "rough:0.0075", "slope:10")
+    assert variation.for_robot(list(HARSH), small) == own
+    biped = robot.load(name=str(Path(__file__).parent / "data" / "biped.toml"))
+    assert [name[:4] for name in variation.for_robot(list(HARSH), biped)] == [
+        *("punc", "roug", "roug", "slop")
+    ]
 
 
 def test_what_was_not_measured_is_not_met():

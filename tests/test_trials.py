@@ -41,7 +41,7 @@ def test_servos_alone_stand_a_second_and_then_fall(still, physics):
 
 
 def test_commands_hold(still):
-    """The commanded velocity reaches the frames and stays; a yaw rate keeps the heading ahead."""
+    """The commanded velocity reaches the frames, at 3 m/s^2; a yaw rate keeps the heading ahead."""
     setting = trials.Setting(C_MUJOCO, seconds=1.0)
     config = trials.trial_config(still.config, setting, 2)
     assert config.command.resample_seconds >= 10.0 and config.env.noise_level == 0.0
@@ -50,11 +50,13 @@ def test_commands_hold(still):
     at = observations.slices(ACTOR)["command"]
     for wanted in ([1.5, 0.0, 0.0], [0.5, -0.3, 0.0], [1.0, 0.0, 0.4]):
         state = env.reset(config, jax.random.key(1), still.curriculum)
-        for _ in range(3):
+        for i in range(1, 4):
             state = trials.with_command(config, state, jnp.array(wanted))
             state, _ = step(config, state, jnp.zeros(16), jax.random.key(2), still.curriculum)
             seen = state.history[-1, at] / np.array([2.0, 2.0, 1.0])
-            np.testing.assert_allclose(seen, wanted, atol=0.01)  # what one step turns the robot
+            due = np.array(wanted[:2]) * 0.03 * i / np.hypot(*wanted[:2])
+            np.testing.assert_allclose(seen[:2], due, atol=1e-6)
+            np.testing.assert_allclose(seen[2], wanted[2], atol=0.01)  # one step turns the robot
 
 
 @pytest.mark.parametrize("rate", [0.3, 3.0, -3.0])

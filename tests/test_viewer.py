@@ -197,7 +197,7 @@ def test_a_session_walks_on_at_the_edge_and_a_fresh_one_stands(still):
         command = 0.19 * np.array([np.cos(angle), np.sin(angle), 0.0])
         live.advance(command)
         fresh.advance(command)
-        moving = live._memory.env.command.velocity[:2]
+        moving = live._memory.env.command.wanted
         assert np.hypot(*moving) == pytest.approx(0.2, rel=1e-4)
         assert (fresh._memory.env.command.velocity == 0.0).all()
     live.advance(np.array([0.17, 0.0, 0.0]))

@@ -1,4 +1,4 @@
-"""What looks wrong with a robot, each in one line with the field to change. XBot-L has none."""
+"""Faults of a robot: one line each, with the field to change. XBot-L has none."""
 
 import math
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""What was derived from a robot's description, as text; and the order of the checks."""
+"""The checks of a robot, in their order, and their results as text."""
 
 import math
 from collections.abc import Iterator
@@ -82,7 +82,7 @@ def _compare(console: Console, name: str) -> Iterator[Finding]:
 
 
 def verdict(found: list[Finding]) -> Table | str:
-    """What looks wrong, one line each."""
+    """The faults that were found, one line each."""
     if not found:
         return "\n[green]nothing looks wrong"
     table = _table(f"{len(found)} things look wrong" if len(found) > 1 else "one thing looks wrong")

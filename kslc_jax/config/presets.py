@@ -55,7 +55,7 @@ _LAPTOP = _override(
     ppo={"entropy_fades": True, "average": 0.98},
     command={
         "shortest_seconds": 1.0,
-        "acceleration": 4.0,
+        "acceleration": 3.0,
         "stand_fraction": 0.15,
         "forward_fraction": 0.2,
         "slow_fraction": 0.15,

@@ -22,6 +22,16 @@ SLOWEST = 0.5
 """Slowest command [m/s] at which the gait is judged."""
 
 
+HARSH: dict[str, tuple[float, tuple[float, ...]]] = {
+    "punch=300": (0.95, (0.0, 1.0, 2.0, 3.0)),
+    "arms=1": (1.0, (0.0, 1.0, 2.0)),
+    "rough:0.05": (1.0, (0.0, 1.0, 2.0)),
+    "rough:0.03": (1.0, (3.0,)),
+    "slope:10": (1.0, (0.0, 1.0, 2.0)),
+}
+"""Harsh conditions: share of the robots that must not fall, and commanded speeds [m/s]."""
+
+
 @dataclass(frozen=True)
 class Bar:
     """One requirement and its result."""
@@ -42,7 +52,8 @@ def bars(results: dict[str, Any], scale: float = 1.0, arms: bool = True) -> list
 
     Args:
       results: of `judge.measure`. "speeds": rows by commanded speed; "schedules" and "perturbed":
-        rows by condition; "drake": rows by commanded speed, only with --drake.
+        rows by condition; "harsh", only with --harsh: the wanted share and the rows by condition;
+        "drake": rows by commanded speed, only with --drake.
       scale: factor on the commanded speeds, see `scaled`.
       arms: True if the robot has arms. Without arms there is no bar on them.
     """
@@ -76,6 +87,10 @@ def bars(results: dict[str, Any], scale: float = 1.0, arms: bool = True) -> list
             1.0,
             _by_condition(results["perturbed"]),
         ),
+    ]
+    found += [
+        _at_least(f"share that does not fall, {condition}", part["wanted"], _upright(part["rows"]))
+        for condition, part in results.get("harsh", {}).items()
     ]
     if "drake" in results:
         found.append(

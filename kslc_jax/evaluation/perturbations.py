@@ -45,6 +45,8 @@ PERTURBATIONS: dict[str, Callable[[float], dict[str, Any]]] = {
         "push_velocity": speed,
         "push_angular": 0.0,
     },
+    "punch": lambda newtons: {"punch": (newtons, newtons)},
+    "arms": lambda share: {"held_arms": share},
     "gains": lambda factor: {"kp": (factor, factor), "kd": (factor, factor)},
     "strength": lambda factor: {"motor_strength": (factor, factor)},
     "imu": lambda angle: {"imu_offset": (angle, angle)},
@@ -65,6 +67,9 @@ ALL = (
 """The conditions of `--perturb all`."""
 
 SCALED_AS = {
+    "rough": "physics.terrain.rough",
+    "stairs": "physics.terrain.stairs",
+    "punch": "randomize.punch",
     "payload": "randomize.base_mass",
     "com": "randomize.base_com",
     "push": "randomize.push_velocity",
@@ -81,9 +86,12 @@ ROBOT = {f.name for f in dataclasses.fields(RandomizeConfig)}
 
 def scaled(condition: str, factors: dict[str, float]) -> str:
     """The condition with its value for a robot of another size; `factors`: `similar.factors`."""
-    name, _, value = condition.partition("=")
+    between = ":" if ":" in condition else "="
+    name, _, value = condition.partition(between)
     factor = factors[SCALED_AS[name]] if name in SCALED_AS else 1.0
-    return condition if factor == 1.0 else f"{name}={float(value) * factor:.2g}"
+    if factor == 1.0:
+        return condition
+    return f"{name}{between}{float(f'{float(value) * factor:.2g}'):g}"  # 150, not 1.5e+02
 
 
 def check_disturbances(punch: float, top: float | None) -> None:

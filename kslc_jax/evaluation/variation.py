@@ -7,6 +7,7 @@ All of them change fields of the mjModel, see `physics.step`.
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import flax.struct
 import jax
@@ -44,8 +45,15 @@ def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
     return tuple(
         perturbations.scaled(condition, factors)
         for condition in conditions
-        if not _lacking(perturbations.changes(condition).get("variation", Variation()), robot)
+        if _possible(perturbations.changes(condition), robot)
     )
+
+
+def _possible(changes: dict[str, Any], robot: Robot) -> bool:
+    """True if the robot can have the `perturbations.changes` of a condition."""
+    if "held_arms" in changes and not robot.is_arm.any():
+        return False
+    return not _lacking(changes.get("variation", Variation()), robot)
 
 
 def require(variation: Variation, robot: Robot) -> None:

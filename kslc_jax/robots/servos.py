@@ -69,7 +69,7 @@ def motors(description: Description, model: mujoco.MjModel, joints: list[int]) -
 
 
 def _of_mjcf(model: mujoco.MjModel, joint: int) -> Motor:
-    """The motor of one joint, as the MJCF has it; what the MJCF leaves open is None.
+    """The motor of one joint, as the MJCF has it. A field that the MJCF does not give is None.
 
     The gains of a joint's actuators add up: some MJCFs have one for the position and one for the
     velocity.
