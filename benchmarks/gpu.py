@@ -15,7 +15,6 @@ one program, bit-exactness, the `paper` preset, larger batches, Brax.
 """
 
 import dataclasses
-import os
 import re
 import sys
 import time
@@ -75,7 +74,7 @@ def first_calls(makes: Mapping[str, Callable[[], Run]]) -> dict[str, Run]:
         print(f"{name}: compiled after {time.monotonic() - start:.0f} s", flush=True)
         return run
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(runtime.usable_cpus()) as pool:
         runs = dict(zip(makes, pool.map(one, makes), strict=True))
     return {name: run for name, run in runs.items() if run is not None}
 

@@ -94,6 +94,7 @@ class Job:
     folder: Path
     config: Config  # of the training; its `run` part is the preset's
     train: tuple[str, ...]  # arguments of kslc_jax.train
+    learning: tuple[str, ...]  # arguments of kslc_jax.learning
     evaluate: tuple[str, ...]  # arguments of kslc_jax.evaluate
 
 
@@ -121,10 +122,12 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     resume = ("--resume",) if has_checkpoints(folder) else ()
     run = ("--run-dir", str(folder), *length, *resume)
     speeds = ("--speeds", *map(str, args.speeds))
-    trials = ("--seeds", str(args.trials), "--fidelity", args.fidelity)
+    fidelity = ("--fidelity", args.fidelity)
+    trials = ("--seeds", str(args.trials), *fidelity)
     kept = ("--json", str(folder / files.EVALUATION))
     evaluation = (str(folder), *speeds, *trials, *kept)
-    return Job(variant, seed, folder, config, (*what, *run), evaluation)
+    learning = (str(folder), *fidelity)
+    return Job(variant, seed, folder, config, (*what, *run), learning, evaluation)
 
 
 def require_ours(job: Job) -> None:
@@ -146,7 +149,7 @@ def run(job: Job, steps: int) -> bool:
         # A training that a signal stopped has saved, and returns exit code 0 too.
         if not (call("train", job.train) and trained(job.folder) >= steps):
             return False
-        if not call("learning", (str(job.folder),)):
+        if not call("learning", job.learning):
             return False
     return call("evaluate", job.evaluate)
 

@@ -7,6 +7,7 @@ import contextlib
 import errno
 import json
 import os
+import re
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Any
@@ -65,6 +66,13 @@ SEED = "seed-"
 def seed_folder(run_dir: Path, seed: int) -> Path:
     """The run folder of one seed of `train --seeds`."""
     return run_dir / f"{SEED}{seed}"
+
+
+def run_name(folder: Path) -> str:
+    """The name of a run in results: that of its folder, RUN-seed2 for the folder RUN/seed-2."""
+    path = folder.resolve()
+    seed = re.fullmatch(f"{SEED}([0-9]+)", path.name)
+    return f"{path.parent.name}-seed{seed[1]}" if seed else path.name
 
 
 def seeds_in(run_dir: Path) -> list[int]:

@@ -72,6 +72,13 @@ _OPTIONS = ("gravity", "integrator", "cone", "solver", "impratio", "tolerance", 
 _MORE_OPTIONS = ("wind", "density", "viscosity", "ls_tolerance", "enableflags", "ccd_tolerance")
 """Further options. Older checkpoints do not have this group."""
 
+_REST_OF_OPTIONS = (
+    *("noslip_iterations", "noslip_tolerance", "ccd_iterations", "jacobian"),
+    *("magnetic", "o_margin", "o_solref", "o_solimp", "o_friction", "sdf_iterations"),
+    *("sdf_initpoints", "sleep_tolerance", "disableactuator"),
+)
+"""The options that the two groups above lack. An older MuJoCo may lack one."""
+
 
 def fingerprint(name: str) -> Fingerprint:
     """The present fingerprint of a robot.
@@ -152,6 +159,9 @@ def _digests(robot: Robot) -> dict[str, str]:
     groups["meshes"] = [_vertices(model, geom) for geom in np.flatnonzero(touching)]
     groups["solver"] = [np.asarray(getattr(model.opt, name)) for name in _OPTIONS]
     groups["further options"] = [np.asarray(getattr(model.opt, name)) for name in _MORE_OPTIONS]
+    groups["rest of the options"] = [
+        np.asarray(getattr(model.opt, name, none)) for name in _REST_OF_OPTIONS
+    ]
     heights = [robot.stand_height, robot.sole_drop, *robot.default_qpos[:7]]
     groups["measures"] = [np.array(heights), robot.hand_points]
     return {group: _digest(arrays) for group, arrays in groups.items()}

@@ -28,7 +28,7 @@ class GaitState:
     contact: jax.Array  # [2] bool, foot contact at the newest step
     lift_z: jax.Array  # [2] m, height of the ankle-roll link at the last contact
     air_time: jax.Array  # [2] s in the air, 0 if grounded (see `update`)
-    landing: jax.Array  # [2] s, air time that ended at this step, else 0
+    landed_air_time: jax.Array  # [2] s, air time that ended at this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
     mean_velocity: jax.Array  # [2] m/s, vx, vy, base frame, mean over about one cycle
     stance: jax.Array  # [2] bool, True: the clock wants this foot on the ground
@@ -49,7 +49,7 @@ def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array
         contact=jnp.zeros(2, bool),
         lift_z=foot_z,
         air_time=zeros,
-        landing=zeros,
+        landed_air_time=zeros,
         swing_height=zeros,
         mean_velocity=zeros,
         stance=stance,
@@ -68,7 +68,7 @@ def update(
     """Advances the clock by `dt` [s] and updates contacts, air times and heights.
 
     A foot is grounded if it has contact, had contact at the step before, or should have it by the
-    clock (HG). When a foot becomes grounded, `landing` is its air time.
+    clock (HG). When a foot becomes grounded, `landed_air_time` is its air time.
     """
     phase = jnp.mod(state.phase + dt / cycle_time, 1.0)
     clock, stance = clock_of(config, phase, command)
@@ -82,7 +82,7 @@ def update(
         contact=contact,
         lift_z=jnp.where(contact, foot_z, state.lift_z),
         air_time=jnp.where(grounded, 0.0, air_time),
-        landing=jnp.where(flown & grounded, air_time, 0.0),
+        landed_air_time=jnp.where(flown & grounded, air_time, 0.0),
         swing_height=foot_z - state.lift_z,
         mean_velocity=state.mean_velocity
         + dt / cycle_time * (signals.base_linvel[:2] - state.mean_velocity),

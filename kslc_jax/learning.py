@@ -85,7 +85,7 @@ def curve(
         points.append({"env_steps": policy.step * policy.config.batch_size, "rows": rows})
         progress((i + 1) / len(folders))
     return {
-        "run": run.resolve().name,
+        "run": files.run_name(run),
         "seeds": args.seeds,
         "seconds": args.seconds,
         "fidelity": args.fidelity,

@@ -271,6 +271,10 @@ def _step_mujoco(
     )
 
 
+_KEPT = ("qpos", "qvel", "qacc_warmstart", "sensordata")
+"""Fields of a simulator batch that `PhysicsState` has."""
+
+
 def _host_step(
     config: PhysicsConfig,
     state: PhysicsState,
@@ -306,16 +310,12 @@ def _host_step(
             batch.bind(name)[:] = value
         for name, value in fields.items():
             batch.expand(name)[:] = value
-        qpos, qvel, warmstart = (batch.bind(n) for n in ("qpos", "qvel", "qacc_warmstart"))
-        qpos[:], qvel[:], warmstart[:] = state.qpos, state.qvel, state.qacc_warmstart
+        # All before the first step: a step fills only what is bound.
+        bound = {name: batch.bind(name) for name in _KEPT}
+        for name in ("qpos", "qvel", "qacc_warmstart"):
+            bound[name][:] = getattr(state, name)
         torque = _physics_steps(config, robot, batch, target, dynamics, moved, state.torque)
-        new = state.replace(
-            qpos=qpos,
-            qvel=qvel,
-            qacc_warmstart=warmstart,
-            sensordata=batch.bind("sensordata"),
-            torque=torque,
-        )
+        new = state.replace(torque=torque, **{name: bound[name] for name in _KEPT})
         return jax.tree.map(
             lambda x, old: np.array(x, old.dtype).reshape(*lead, *x.shape[1:]), new, like
         )

@@ -15,13 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
 import tyro
+from matplotlib.figure import Figure
 
 from kslc_jax import cli, files, records
 from kslc_jax.cli import Paths
@@ -53,7 +49,8 @@ MOMENTUM: tuple[tuple[str, str], ...] = (
 
 def learning_curve(runs: dict[str, Records], out: Path) -> None:
     """Draws one panel per quantity and one line per run, with the wall times of the first run."""
-    figure, axes = plt.subplots(len(PANELS), 1, figsize=(8, 10), sharex=True, layout="constrained")
+    figure = Figure(figsize=(8, 10), layout="constrained")
+    axes = figure.subplots(len(PANELS), 1, sharex=True)
     for axis, (name, label, color) in zip(axes, PANELS, strict=True):
         for i, (run, columns) in enumerate(runs.items()):
             line = color if len(runs) == 1 else f"C{i}"
@@ -105,9 +102,8 @@ def _panels(count: int, **style):
     columns = min(count, 4)
     rows = -(-count // columns)
     size = (3.5 * columns, 3 * rows + 0.5)
-    figure, axes = plt.subplots(
-        rows, columns, figsize=size, sharex=True, squeeze=False, layout="constrained", **style
-    )
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False, **style)
     for axis in axes.flat[count:]:
         axis.set_visible(False)
     for axis in axes.flat[count - columns : count]:
@@ -139,7 +135,8 @@ def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: 
 
 def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
     """Draws the paper's performance figure: one panel per metric, over the commanded speed."""
-    figure, axes = plt.subplots(2, 3, figsize=(12, 7), sharex=True, layout="constrained")
+    figure = Figure(figsize=(12, 7), layout="constrained")
+    axes = figure.subplots(2, 3, sharex=True)
     for axis, (name, label) in zip(axes.flat, PERFORMANCE, strict=True):
         for i, (method, seeds) in enumerate(methods.items()):
             _over_commands(axis, method, f"C{i}", seeds, name)
@@ -173,15 +170,8 @@ def schedules(rows: list[dict], out: Path) -> None:
     """Draws commanded and actual speed over time: a column per schedule, a row per robot."""
     robots = max(len(row["series"]["forward"]) for row in rows)
     size = (5 * len(rows), 2 * robots + 0.5)
-    figure, axes = plt.subplots(
-        robots,
-        len(rows),
-        figsize=size,
-        sharex=True,
-        sharey=True,
-        squeeze=False,
-        layout="constrained",
-    )
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(robots, len(rows), sharex=True, sharey=True, squeeze=False)
     for column, row in zip(axes.T, rows, strict=True):
         column[0].set_title(f"{row['schedule']}: {row['survival']:.0%} survived", fontsize=9)
         lines = row["series"]
@@ -207,7 +197,8 @@ def conditions(results: dict[str, list[dict]], out: Path) -> None:
     columns = [records.row_name(row) for row in next(iter(results.values()))]
     survival = np.array([[row["survival"] for row in rows] for rows in results.values()])
     size = (2.5 + 1.1 * len(columns), 1.2 + 0.45 * len(results))
-    figure, axis = plt.subplots(figsize=size, layout="constrained")
+    figure = Figure(figsize=size, layout="constrained")
+    axis = figure.subplots()
     image = axis.imshow(survival, vmin=0.0, vmax=1.0, cmap="viridis", aspect="auto")
     for i, rows in enumerate(results.values()):
         for j, row in enumerate(rows):
@@ -224,13 +215,10 @@ def conditions(results: dict[str, list[dict]], out: Path) -> None:
     _save(figure, out)
 
 
-def _save(figure, out: Path) -> None:
-    try:
-        files.require_writable(out)
-        with files.saving(out) as part:
-            figure.savefig(part, dpi=130)
-    finally:
-        plt.close(figure)
+def _save(figure: Figure, out: Path) -> None:
+    files.require_writable(out)
+    with files.saving(out) as part:
+        figure.savefig(part, dpi=130)
 
 
 @dataclass(frozen=True)
@@ -295,10 +283,10 @@ class Conditions:
     """File of the figure."""
 
 
-Figure = Training | Learning | Performance | Momentum | Schedules | Conditions
+Drawing = Training | Learning | Performance | Momentum | Schedules | Conditions
 
 
-def draw(args: Figure) -> None:
+def draw(args: Drawing) -> None:
     """Draws the figure of `args`.
 
     Raises:
@@ -333,7 +321,7 @@ def _training(args: Training) -> None:
     learning_curve(runs, args.out)
 
 
-def _run(args: Figure) -> None:
+def _run(args: Drawing) -> None:
     try:
         draw(args)
     except ValueError as error:
@@ -343,7 +331,7 @@ def _run(args: Figure) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    kinds: Any = Figure
+    kinds: Any = Drawing
     return cli.run(lambda: _run(cli.parse("plots", kinds, argv, __doc__)))
 
 

@@ -136,13 +136,14 @@ def save_policy(policy: Policy, folder: Path) -> None:
 def policy_name(path_or_name: str | Path) -> str:
     """The name of a policy in published results: without the folders of this machine.
 
-    A run, a stored policy and a shipped policy have the name of their folder. A checkpoint has the
-    name of its run.
+    A run, a stored policy and a shipped policy have the name of `files.run_name`. A checkpoint has
+    the name of its run.
     """
     path = Path(path_or_name).resolve()
     if path.name.isdigit() and path.parent.name in (files.CHECKPOINTS, files.SNAPSHOTS):
         path = path.parent
-    return path.parent.name if path.name in (files.CHECKPOINTS, files.SNAPSHOTS) else path.name
+    run = path.parent if path.name in (files.CHECKPOINTS, files.SNAPSHOTS) else path
+    return files.run_name(run)
 
 
 def checkpoint_folder(path: Path) -> Path:

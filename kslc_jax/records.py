@@ -74,7 +74,7 @@ def read_evaluations(paths: Sequence[Path]) -> dict[str, list[list[dict[str, flo
             _ = [float(row["command"]) for row in rows]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"{path} is no evaluation (of evaluate or sim2sim --json)") from error
-        name = path.resolve().parent.name if path.name == files.EVALUATION else path.stem
+        name = files.run_name(path.parent) if path.name == files.EVALUATION else path.stem
         found.setdefault(_method(name), []).append(rows)
     for name, seeds in found.items():
         if len({tuple(row["command"] for row in rows) for rows in seeds}) > 1:

@@ -114,13 +114,17 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     """
     from kslc_jax import records
     from kslc_jax.checkpoint_format import has_checkpoints
-    from kslc_jax.training import loop
+    from kslc_jax.training import loop, run_folder
     from kslc_jax.training.logs import Progress
 
     run = dataclasses.replace(config.run, steps=round(until))
     config = dataclasses.replace(config, seed=args.seed, run=run)
     going_on = has_checkpoints(args.run_dir)
-    state = loop.train(config, args.run_dir, going_on, Progress(config))
+    progress = Progress(config)
+    if going_on:
+        here = run_folder.circumstances(config, 1)
+        progress.say(f"resume {run_folder.what_changed(args.run_dir, here)}".rstrip())
+    state = loop.train(config, args.run_dir, going_on, progress)
     if int(state.step) < config.num_updates:
         raise Stopped("stopped; the same command tries the policy again and goes on training")
     metrics = records.read_metrics(args.run_dir)

@@ -171,7 +171,7 @@ def feet_contact_number(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -
 
 def feet_air_time(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """Sum of the air times [s] of the feet that just landed, at most `longest_air_time` each."""
-    return jnp.sum(jnp.clip(x.gait.landing, 0.0, cfg.longest_air_time))
+    return jnp.sum(jnp.clip(x.gait.landed_air_time, 0.0, cfg.longest_air_time))
 
 
 def foot_slip(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:

@@ -37,7 +37,7 @@ CUDA_FIX = "pip install 'kslc_jax[cuda]'"
 NVIDIA = Path("/dev/nvidia0")
 """A file that exists if the driver of an NVIDIA GPU is loaded."""
 
-NUMERICS: dict[str, str | bool | int | None] = {
+NUMERICS: dict[str, str | bool | float | None] = {
     "jax_enable_x64": False,
     "jax_default_matmul_precision": None,
     "jax_default_prng_impl": "threefry2x32",
@@ -48,6 +48,8 @@ NUMERICS: dict[str, str | bool | int | None] = {
     "jax_disable_jit": False,
     "jax_debug_nans": False,
     "jax_debug_infs": False,
+    "jax_optimization_level": "UNKNOWN",
+    "jax_exec_time_optimization_effort": 0.0,
 }
 """Options of JAX that change numbers, or that stop at a NaN although this package masks it. All
 commands use these values, which are JAX's defaults."""
@@ -123,10 +125,15 @@ def own_numerics() -> Generator[None]:
                 options.update(name, value)
 
 
-def _means(text: str, value: str | bool | int | None) -> bool:
+def _means(text: str, value: str | bool | float | None) -> bool:
     """True if JAX reads `text` in the environment as `value`."""
     if isinstance(value, bool):
         return text.lower() in (_YES if value else _NO)
+    if isinstance(value, float):
+        try:
+            return float(text) == value
+        except ValueError:
+            return False
     return text == str(value)
 
 
@@ -202,6 +209,8 @@ def quiet() -> None:
     # Orbax raises its errors. It also prints pages of tracebacks of its threads.
     for name in ("absl", "asyncio"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
+    # Drake warns about deformable bodies at every half space, though there are none.
+    logging.getLogger("drake").setLevel(logging.ERROR)
     sys.excepthook, sys.unraisablehook = _excepthook, _unraisablehook
     warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
 

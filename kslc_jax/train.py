@@ -21,6 +21,7 @@ import argparse
 import dataclasses
 import re
 import sys
+import threading
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -235,6 +236,8 @@ def main(argv: list[str] | None = None) -> int:
 def _main(argv: list[str]) -> int:
     join(argv)
     args = parse(argv)
+    if not threading.main_thread().is_alive():
+        raise UserError("the program has ended: let it wait for the training, with thread.join()")
     runtime.require_good_jax()
     from kslc_jax.training import devices
 

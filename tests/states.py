@@ -58,7 +58,7 @@ def make_gait(**changes: Any) -> GaitState:
         contact=[True, True],
         lift_z=[0.05, 0.05],
         air_time=[0.0, 0.0],
-        landing=[0.0, 0.0],
+        landed_air_time=[0.0, 0.0],
         swing_height=[0.0, 0.0],
         mean_velocity=[0.0, 0.0],
         stance=[True, True],

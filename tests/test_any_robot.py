@@ -349,6 +349,18 @@ def test_a_training_keeps_its_robot(mine, tmp_path):
         same_training.difference(kept, dataclasses.replace(setup, physics=engine))
 
 
+def test_a_robot_with_an_absolute_path_is_not_copied(tmp_path):
+    """The copy would work on this machine only, and name one of its folders."""
+    data = Path(BIPED).parent
+    (tmp_path / "biped.toml").write_text((data / "biped.toml").read_text())
+    text = (data / "biped.xml").read_text()
+    meshes = f'<compiler meshdir="{tmp_path}" '
+    assert text.count("<compiler ") == 1
+    (tmp_path / "biped.xml").write_text(text.replace("<compiler ", meshes))
+    with pytest.raises(RobotError, match=r"meshdir=.* of <compiler> is an absolute path"):
+        copying.copy(str(tmp_path / "biped.toml"), tmp_path / "robot")
+
+
 def test_the_copy_of_a_robot_in_a_package_is_its_description(tmp_path):
     try:
         about = description.read("unitree_g1").path

@@ -107,6 +107,8 @@ NUMERICS = {
     "JAX_DEFAULT_MATMUL_PRECISION": "bfloat16",
     "JAX_THREEFRY_PARTITIONABLE": "0",
     "JAX_RANDOM_SEED_OFFSET": "3",
+    "JAX_OPTIMIZATION_LEVEL": "O0",
+    "JAX_EXEC_TIME_OPTIMIZATION_EFFORT": "-0.5",
 }
 
 
@@ -137,13 +139,14 @@ def test_variables_that_change_nothing_are_no_word(monkeypatch, capsys):
     monkeypatch.setenv("JAX_ENABLE_X64", "False")
     monkeypatch.setenv("JAX_THREEFRY_PARTITIONABLE", "1")
     monkeypatch.setenv("JAX_DEBUG_NANS", "")
+    monkeypatch.setenv("JAX_EXEC_TIME_OPTIMIZATION_EFFORT", "0")
     runtime.prepare(gl=False)
     assert capsys.readouterr().err == ""
 
 
 def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
     """A notebook may have set them before it calls a command."""
-    before = {name: getattr(jax.config, name) for name in runtime.NUMERICS}
+    before = {name: getattr(jax.config, name, x) for name, x in runtime.NUMERICS.items()}
     assert before == runtime.NUMERICS  # JAX's defaults, with the oldest JAX and the newest
     try:
         jax.config.update("jax_enable_x64", True)
@@ -151,7 +154,7 @@ def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
         runtime.prepare(gl=False)
         said = capsys.readouterr().err
         assert "JAX_ENABLE_X64=True" in said and "MATMUL_PRECISION=bfloat16" in said
-        assert {name: getattr(jax.config, name) for name in runtime.NUMERICS} == before
+        assert before == {name: getattr(jax.config, name, x) for name, x in before.items()}
         jax.config.update("jax_enable_x64", True)
         inside = []
         assert cli.run(lambda: inside.append(jax.config.jax_enable_x64)) == 0

@@ -182,6 +182,7 @@ def test_devices_tell_what_the_documentation_counts(glided):
         "frames": n
         * (actor * observations.actor_width(XBOT) + critic * observations.critic_width(XBOT)),
         "action and mean": 2 * n * t * XBOT.count,
+        "velocities": 3 * n * t,
         "log_prob, value, advantage, target, age, valid": 6 * n * t,
     }
     assert set(told) == {"all-gather", "all-reduce"}

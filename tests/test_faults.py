@@ -503,6 +503,16 @@ class TestAround:
         thread.join()
         assert codes == [0] and "done: 8 train steps" in capsys.readouterr().out
 
+    def test_in_a_thread_that_nobody_waits_for(self):
+        """Python forbids new threads as soon as the main thread has ended."""
+        code = (
+            "import threading; from kslc_jax import train; threading.Thread("
+            "target=lambda: print(train.main(['--preset', 'debug']))).start()"
+        )
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert done.stdout == "2\n" and done.stderr.count("\n") == 1
+        assert "thread.join()" in done.stderr
+
     def test_in_a_notebooks_cell_twice(self, training, capsys):
         """A cell runs within an event loop; its output has no file descriptor."""
 
@@ -863,6 +873,15 @@ class TestSchema:
         assert "--start-from" in line
         assert files_of(run) == before
 
+    def test_policies_of_all_older_schemas_load(self, saved, tmp_path):
+        assert tuple(range(1, checkpoint_format.SCHEMA_VERSION)) == checkpoint_format.OLDER_POLICIES
+        for schema in checkpoint_format.OLDER_POLICIES:
+            older = {"schema": schema, "checksums": {}}
+            edit_meta(
+                saved(tmp_path / str(schema), 1), lambda meta, older=older: meta.update(older)
+            )
+            assert policy_lib.load_policy(tmp_path / str(schema)).step == 1
+
     def test_tree_of_this_schema(self, like):
         """A change of the tree needs a new SCHEMA_VERSION. Else old checkpoints fail with errors of
         orbax."""
@@ -983,6 +1002,18 @@ class TestChangedRobot:
         values.add("key_qpos")
         derived = {"body_invweight0", "dof_invweight0", "body_subtreemass", "geom_rbound"}
         assert "body_mass" in silent and silent <= values | derived
+
+    def test_every_option_of_the_simulation_counts(self):
+        """The config has the time step and the iterations."""
+        xbot = robot.load()
+        before = fingerprint._digests(xbot)
+        names = {name for name in dir(xbot.mj_model.opt) if not name.startswith("_")}
+        assert {"noslip_iterations", "jacobian", "o_margin", "wind"} < names
+        for name in names - {"timestep", "iterations", "ls_iterations"}:
+            model = copy.copy(xbot.mj_model)
+            setattr(model.opt, name, getattr(model.opt, name) + 1)
+            now = fingerprint._digests(dataclasses.replace(xbot, mj_model=model))
+            assert len({g for g in before if before[g] != now[g]}) == 1, name
 
     def test_resume_and_policy_say_so(self, saved, restored, tmp_path, edit_robot):
         saved(tmp_path, 1)

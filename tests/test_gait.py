@@ -329,11 +329,11 @@ def test_air_time_and_landing():
     right = [True, False, False, False, True, True, False, False]
     states = play([(False, c) for c in right], [(0.05, 0.05)] * 8)
     air = [round(float(s.air_time[1]), 4) for s in states]
-    landing = [round(float(s.landing[1]), 4) for s in states]
+    landing = [round(float(s.landed_air_time[1]), 4) for s in states]
     assert air == [0.0, 0.0, 0.01, 0.02, 0.0, 0.0, 0.0, 0.01]
     assert landing == [0.0, 0.0, 0.0, 0.0, 0.03, 0.0, 0.0, 0.0]
     # The clock has the left foot in stance all the time, so contact does not matter.
-    assert all(float(s.air_time[0]) == float(s.landing[0]) == 0.0 for s in states)
+    assert all(float(s.air_time[0]) == float(s.landed_air_time[0]) == 0.0 for s in states)
     assert [s.contact.tolist() for s in states] == [[False, c] for c in right]
 
 
@@ -342,7 +342,7 @@ def test_the_clock_alone_ends_the_air_time():
     states = play([(True, False)] * 4, [(0.05, 0.2)] * 4, phase=0.45, cycle_time=1.0)
     assert [round(float(s.phase), 4) for s in states] == [0.46, 0.47, 0.48, 0.49]
     assert [round(float(s.air_time[1]), 4) for s in states] == [0.01, 0.02, 0.03, 0.0]
-    assert [round(float(s.landing[1]), 4) for s in states] == [0.0, 0.0, 0.0, 0.04]
+    assert [round(float(s.landed_air_time[1]), 4) for s in states] == [0.0, 0.0, 0.0, 0.04]
 
 
 def test_swing_height_is_above_the_last_contact():
@@ -382,7 +382,7 @@ def test_bookkeeping_is_humanoid_gyms_over_random_contacts():
         air = air * ~filtered
         height = height + feet[i] - last_z
         last_z = feet[i]
-        np.testing.assert_allclose(state.landing, landing, atol=1e-5)
+        np.testing.assert_allclose(state.landed_air_time, landing, atol=1e-5)
         np.testing.assert_allclose(state.air_time, air, atol=1e-5)
         np.testing.assert_allclose(state.swing_height, height, atol=1e-5)
         height = height * ~contacts[i]

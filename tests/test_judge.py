@@ -18,6 +18,7 @@ def row(command, **changes):
     good = {
         "survival": 1.0,
         "forward_mean": command,
+        **({} if command else {"drift": 0.002}),
         "lateral_mean": 0.0,
         "stride_frequency": 1.5 if command else 0.0,
         "within_speed_limits": 1.0,
@@ -43,7 +44,7 @@ def good():
 def test_a_good_policy_meets_all_bars():
     """The row of 4.5 m/s is only reported."""
     found = bars(good())
-    assert len(found) == 12 and all(bar.met for bar in found)
+    assert len(found) == 13 and all(bar.met for bar in found)
 
 
 @pytest.mark.parametrize(
@@ -52,6 +53,7 @@ def test_a_good_policy_meets_all_bars():
         (3, {"survival": 0.5}, "nobody falls, 0 to 4 m/s", 0.5),
         (1, {"forward_mean": 0.45}, "speed error, 0.5 to 4 m/s, share", 0.1),
         (0, {"forward_mean": -0.05}, "speed at command 0 [m/s]", 0.05),
+        (0, {"drift": 0.01}, "drift at command 0 [m/s]", 0.01),
         (0, {"stride_frequency": 1.0}, "strides a second at command 0", 1.0),
         (2, {"within_speed_limits": 0.9}, "joints within speed limits, to 3.5 m/s", 0.9),
         (1, {"shoulder_hip_correlation": 0.8}, "arm-leg correlation", 0.8),
@@ -89,7 +91,7 @@ def test_harsh_conditions_are_bars_where_they_were_tried():
     rows = [row(0.0), row(1.0, survival=0.96)]
     parts = {"punch=300": {"wanted": 0.95, "rows": rows}, "arms=1": {"wanted": 1.0, "rows": rows}}
     found = bars(good() | {"harsh": parts})
-    assert len(found) == 14
+    assert len(found) == 15
     (missed,) = [bar for bar in found if not bar.met]
     assert missed.name == "share that does not fall, arms=1" and missed.value == 0.96
     assert missed.where == "1 m/s"
@@ -142,7 +144,7 @@ def test_a_smaller_robot_has_slower_bars_and_one_without_arms_has_none_on_them()
         for line in part:
             line |= {"command": line["command"] / 2, "forward_mean": line["forward_mean"] / 2}
     found = bars(results, scale=0.5, arms=False)
-    assert len(found) == 11 and all(bar.met for bar in found)
+    assert len(found) == 12 and all(bar.met for bar in found)
     assert found[0].name == "nobody falls, 0 to 2 m/s"
     results["speeds"][3]["survival"] = 0.5
     (missed,) = [bar for bar in bars(results, scale=0.5) if not bar.met]
@@ -192,9 +194,9 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
     assert judge.main(["xbot_l_run", "--json", str(out)]) == 0
     shown = capsys.readouterr().out
     assert "speed at command 0 [m/s]" in shown  # rich takes it for a style unless told
-    assert shown.count("yes") == 11 and shown.count("NO") == 1
+    assert shown.count("yes") == 12 and shown.count("NO") == 1
     kept = json.loads(out.read_text())
-    assert len(kept["bars"]) == 12 and kept["size"]["seeds"] == judge.FULL.seeds
+    assert len(kept["bars"]) == 13 and kept["size"]["seeds"] == judge.FULL.seeds
     assert len(kept["perturbed"]) == 16 and len(kept["schedules"]) == 4
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from kslc_jax import plots, records
 
@@ -107,11 +108,10 @@ def test_what_nobody_survived_leaves_a_gap(evaluations, tmp_path):
             for row in content["rows"]
         ]
         path.write_text(json.dumps(content))
-    figure, axis = plots.plt.subplots()
+    axis = Figure().subplots()
     seeds = records.read_evaluations(evaluations)["kslc"]
     plots._over_commands(axis, "kslc", "C0", seeds, "forward_std")
     drawn = axis.lines[0].get_xydata()
-    plots.plt.close(figure)
     np.testing.assert_allclose(drawn, [[1.0, 0.95], [2.0, 2.0]])
     assert (
         plots.main(["performance", *map(str, evaluations), "--out", str(tmp_path / "p.png")]) == 0
@@ -132,7 +132,6 @@ def drawn_texts(results, tmp_path, monkeypatch):
     (tmp_path / "x.json").write_text(json.dumps({"conditions": results}))
     assert plots.main(["conditions", str(tmp_path / "x.json")]) == 0
     axis = figures[0].axes[0]
-    plots.plt.close(figures[0])
     ticks = (axis.get_xticklabels(), axis.get_yticklabels())
     labels = [[label.get_text() for label in row] for row in ticks]
     return labels, [text.get_text() for text in axis.texts]

@@ -41,17 +41,19 @@ def test_warnings_ask_and_never_interrupt(name):
         assert stop.requested == name
 
 
-def test_nohup_keeps_its_promise():
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+@pytest.mark.parametrize("ignored", [signal.SIGHUP, signal.SIGINT])
+def test_an_ignored_signal_stays_ignored(ignored):
+    """SIGHUP under nohup; SIGINT in a job that a shell script starts in the background."""
+    before = signal.signal(ignored, signal.SIG_IGN)
     try:
         with stopping.stop_requests() as stop:
-            signal.raise_signal(signal.SIGHUP)
+            signal.raise_signal(ignored)
             assert stop.requested is None
             signal.raise_signal(signal.SIGTERM)
             assert stop.requested == "SIGTERM"
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        assert signal.getsignal(ignored) == signal.SIG_IGN
     finally:
-        signal.signal(signal.SIGHUP, before)
+        signal.signal(ignored, before)
 
 
 def test_in_another_thread_signals_stay_as_they_are():

@@ -1,4 +1,5 @@
-"""The structure of the package: imports have no cycle, and the evaluation needs no training."""
+"""The structure of the package: imports have no cycle, the evaluation needs no training, commands
+start without JAX, only `robots` names the parts of a robot, and functions are short."""
 
 import ast
 import importlib.util
@@ -112,6 +113,22 @@ def test_no_training_is_loaded_with_judging_and_looking():
 def test_configs_and_commands_load_no_jax():
     for name, loaded in loaded_by(*(f"kslc_jax.{name}" for name in LIGHT)).items():
         assert not {"jax", "mujoco", "orbax"} & loaded, name
+
+
+def test_only_robots_names_the_parts_of_a_robot():
+    """The rest reads them from the model. Roles, such as left_knee, are no names of parts."""
+    from kslc_jax import robot
+
+    xbot = robot.load("high")
+    model = xbot.mj_model
+    parts = {model.joint(i).name for i in range(model.njnt)} | set(xbot.joint_names)
+    parts |= {model.body(i).name for i in range(1, model.nbody)}
+    parts -= xbot.anatomy.roles.keys()
+    assert {"left_leg_pitch_joint", "base_link"} <= parts
+    for name, path in MODULES.items():
+        tree = ast.parse(path.read_text())
+        texts = {x.value for x in ast.walk(tree) if isinstance(x, ast.Constant)}
+        assert name.startswith("kslc_jax.robots") or not texts & parts, name
 
 
 MOST_OF_BODY, MOST_OF_MODULE = 40, 300

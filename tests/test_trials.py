@@ -13,7 +13,7 @@ from states import ACTOR
 
 from kslc_jax import commands, curriculum, env, evaluate, networks, observations
 from kslc_jax import policy as policy_lib
-from kslc_jax.config import HighFidelity, PhysicsConfig, preset
+from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import gait_metrics, trials
 
 DT = 0.01
@@ -38,6 +38,22 @@ def test_servos_alone_stand_a_second_and_then_fall(still, physics):
     assert not np.any(np.diff(trace.alive.astype(int), axis=0) > 0)
     weight = (trace.contact[30:80]).mean()
     assert weight > 0.9
+
+
+@pytest.mark.parametrize(("decimation", "steps"), [(2, 10), (4, 20), (3, 15)])
+def test_high_fidelity_keeps_the_policys_control_step(still, decimation, steps):
+    physics = dataclasses.replace(C_MUJOCO, decimation=decimation)
+    policy = dataclasses.replace(still, config=dataclasses.replace(still.config, physics=physics))
+    high = trials.engine(policy, "high")
+    assert high.timestep == 0.001 and high.decimation == steps
+    assert high.control_dt == pytest.approx(policy.config.control_dt)
+
+
+def test_a_control_step_that_high_fidelity_cannot_have_is_refused(still):
+    physics = dataclasses.replace(C_MUJOCO, timestep=0.0025, decimation=3)
+    policy = dataclasses.replace(still, config=dataclasses.replace(still.config, physics=physics))
+    with pytest.raises(ConfigError, match=r"control step of 0\.0075 s"):
+        trials.engine(policy, "high")
 
 
 def test_commands_hold(still):
@@ -308,6 +324,8 @@ def test_the_shipped_policy_walks_and_runs():
         ("runs/mine/checkpoints/120", "mine"),
         ("runs/mine/snapshots/120", "mine"),
         ("runs/7", "7"),
+        ("runs/mine/seed-2", "mine-seed2"),
+        ("runs/mine/seed-2/snapshots/120", "mine-seed2"),
     ],
 )
 def test_results_name_a_run_and_no_folder(path, name, tmp_path, monkeypatch):
@@ -315,3 +333,17 @@ def test_results_name_a_run_and_no_folder(path, name, tmp_path, monkeypatch):
     assert policy_lib.policy_name(path) == name
     assert policy_lib.policy_name(tmp_path / path) == name
     assert policy_lib.policy_name(".") == tmp_path.name
+
+
+def test_drift_is_that_of_the_robot_that_drifts_most():
+    """Two robots drift by 3 and 4 cm in one second, in opposite directions: means hide it."""
+    trace, seconds = synthetic(), 1.0
+    start = round(gait_metrics.SETTLE / DT)
+    steps = start + round(seconds / DT) + 1
+    qpos = np.zeros((steps, 2, trace.qpos.shape[-1]))
+    qpos[start:, 0, 0] = np.linspace(0.0, 0.03, steps - start)
+    qpos[start:, 1, 0] = -np.linspace(0.0, 0.04, steps - start)
+    rest = jax.tree.map(lambda x: np.zeros((steps, 2, *x.shape[2:]), x.dtype), trace)
+    rest = rest.replace(qpos=qpos, alive=np.ones((steps, 2), bool))
+    assert gait_metrics.speed(rest, 0.0, DT)["drift"] == pytest.approx(0.04 / seconds)
+    assert "drift" not in gait_metrics.speed(rest, 1.0, DT)

@@ -2,14 +2,10 @@
 
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import mujoco
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from scipy.spatial import ConvexHull, QhullError
@@ -57,17 +53,15 @@ def draw(robot: Robot, out: Path) -> None:
       ConfigError: the file cannot be written.
     """
     data = statics.posed(robot, statics.on_the_ground(robot))
-    figure, axes = plt.subplots(1, 2, figsize=(8, 8.5), sharey=True, layout="constrained")
+    figure = Figure(figsize=(8, 8.5), layout="constrained")
+    axes = figure.subplots(1, 2, sharey=True)
     for axis, view in zip(axes, VIEWS, strict=True):
         _view(axis, robot, data, view)
     axes[0].set_ylabel("height [m]")
     figure.suptitle(f"{robot.name} at home: {robot.count} joints, {robot.total_mass:.1f} kg")
     figure.legend(handles=_legend(robot), loc="outside lower center", ncols=5, fontsize=8)
-    try:
-        with files.saving(out) as part:
-            figure.savefig(part, dpi=100)
-    finally:
-        plt.close(figure)
+    with files.saving(out) as part:
+        figure.savefig(part, dpi=100)
 
 
 def _view(axis: Axes, robot: Robot, data: mujoco.MjData, view: str) -> None:

@@ -70,6 +70,7 @@ def bars(results: dict[str, Any], scale: float = 1.0, arms: bool = True) -> list
             f"speed error, {slowest:g} to {top:g} m/s, share", 0.03, _each(gait, _speed_error)
         ),
         _at_most("speed at command 0 [m/s]", 0.03, _each(rest, _creep)),
+        _at_most("drift at command 0 [m/s]", 0.005, _of(rest, "drift")),
         _at_most("strides a second at command 0", 0.05, _of(rest, "stride_frequency")),
         _at_least("nobody falls, random schedule", 1.0, _by_condition(results["schedules"])),
         _at_least(

@@ -9,7 +9,6 @@ It needs the package drake: pip install 'kslc_jax[drake]'.
 
 import copy
 import functools
-import logging
 import threading
 from dataclasses import dataclass
 
@@ -61,9 +60,6 @@ KINEMATICS = (
     mujoco.mj_sensorVel,
 )
 """Stages of MuJoCo that compute its position and velocity sensors."""
-
-# Drake warns about deformable bodies at every half space. The model has no deformable bodies.
-logging.getLogger("drake").setLevel(logging.ERROR)
 
 _lock = threading.Lock()
 

@@ -110,11 +110,20 @@ def engine(
 ) -> PhysicsConfig:
     """The physics config: that of the policy's training ("train"), or high fidelity ("high").
 
-    Without `terrain` the floor is flat.
+    The control step is that of the training. Without `terrain` the floor is flat.
+
+    Raises:
+      ConfigError: at high fidelity, no number of physics steps fills the control step.
     """
     trained, terrain = policy.config.physics, terrain or TerrainConfig()
     if fidelity == "high":
-        return HighFidelity(robot=trained.robot, terrain=terrain)
+        exact = trained.control_dt / HighFidelity.timestep
+        if abs(exact - round(exact)) > 1e-6 * exact:
+            raise ConfigError(
+                f"high fidelity has steps of {HighFidelity.timestep:g} s, which do not fill this "
+                f"policy's control step of {trained.control_dt:g} s"
+            )
+        return HighFidelity(robot=trained.robot, terrain=terrain, decimation=round(exact))
     return dataclasses.replace(trained, terrain=terrain)
 
 

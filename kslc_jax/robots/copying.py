@@ -6,6 +6,7 @@ import re
 import shutil
 import tomllib
 from pathlib import Path
+from xml.etree import ElementTree
 
 import mujoco
 
@@ -13,6 +14,9 @@ from kslc_jax.robots import description
 from kslc_jax.robots.description import RobotError
 
 _MJCF_LINE = re.compile(r"""^\s*["']?mjcf["']?\s*=.*$""", re.MULTILINE)
+
+_PATHS = {"file", "dir", "assetdir", "meshdir", "texturedir"}
+"""Attributes of an MJCF that hold a path."""
 
 INSIDE = "mjcf"
 """Folder of the copy that holds the MJCF and its files."""
@@ -29,7 +33,8 @@ def copy(name: str, folder: Path) -> None:
       folder: of the copy.
 
     Raises:
-      RobotError: the description's mjcf does not stand in one line.
+      RobotError: the description's mjcf does not stand in one line, or an MJCF names a file by an
+        absolute path, which another machine does not have.
       OSError: a file cannot be read or written.
     """
     about = description.read(name)
@@ -51,9 +56,24 @@ def _copy_mjcf(mjcf: Path, folder: Path) -> str:
     """Copies an MJCF and the files that it names; returns its path within the folder."""
     mjcf = Path(os.path.abspath(mjcf))
     needed = [Path(os.path.abspath(f)) for f in mujoco.mju_getXMLDependencies(str(mjcf))]
+    for file in needed:
+        _require_relative(file)
     root = Path(os.path.commonpath([file.parent for file in needed]))
     for file in needed:
         target = folder / file.relative_to(root)
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(file, target)
     return mjcf.relative_to(root).as_posix()
+
+
+def _require_relative(file: Path) -> None:
+    """RobotError if the file is an MJCF that has an absolute path."""
+    if file.suffix.lower() != ".xml":
+        return
+    for element in ElementTree.parse(file).iter():
+        for name in _PATHS & element.attrib.keys():
+            if os.path.isabs(path := element.attrib[name]):
+                raise RobotError(
+                    f"{file}: {name}={path!r} of <{element.tag}> is an absolute path; make it "
+                    "relative, so that trainings and policies can keep a copy of the robot"
+                )

@@ -85,7 +85,8 @@ def _update(
     frames = _bytes(read) + before
     window = _bytes(histories) / config.env.num_envs
     inputs = window * (2 if config.network.symmetric else 1)  # a copy in even and odd parts
-    kept = NUMBER * KEPT_PER_UNIT * (sum(config.network.actor) + sum(config.network.critic))
+    units = sum(config.network.actor + config.network.critic + config.network.estimator)
+    kept = NUMBER * KEPT_PER_UNIT * units
     return frames + _bytes(samples) + config.minibatch_size / devices * (inputs + kept)
 
 

@@ -54,7 +54,8 @@ def require(run_dir: Path, stored: Config, wanted: Config) -> None:
     try:
         difference(stored, wanted)
     except ConfigError as error:
-        if _networks(stored) == _networks(wanted):
+        robots = identity(stored.physics.robot), identity(wanted.physics.robot)
+        if robots[0] == robots[1] and _networks(stored) == _networks(wanted):
             more, where = ["--start-from", str(run_dir)], "with this run's networks and curriculum"
         else:
             more, where = [], "from the start"

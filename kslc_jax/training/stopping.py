@@ -26,20 +26,18 @@ def handling(handler: Handler) -> Generator[None]:
     """Within the context, each of `SIGNALS` calls `handler`.
 
     In another thread than the main thread this changes nothing, because Python handles signals in
-    the main thread only. An ignored SIGHUP stays ignored, because nohup needs that.
+    the main thread only. An ignored signal stays ignored: nohup needs that for SIGHUP, and a
+    shell's background jobs for Ctrl-C.
     """
     main = threading.current_thread() is threading.main_thread()
-    old = {s: signal.signal(s, handler) for s in SIGNALS if main and not _under_nohup(s)}
+    ours = [s for s in SIGNALS if main and signal.getsignal(s) != signal.SIG_IGN]
+    old = {s: signal.signal(s, handler) for s in ours}
     try:
         yield
     finally:
         for number, before in old.items():
             # None: the handler was not set by Python, so Python cannot restore it.
             signal.signal(number, signal.SIG_DFL if before is None else before)
-
-
-def _under_nohup(number: signal.Signals) -> bool:
-    return number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN
 
 
 class Stop:

@@ -91,12 +91,14 @@ def write_video(path: Path, robot, trace, spans: Sequence[range], dt: float) -> 
         write_animation(path, film(robot, trace, spans, every, dt), every * dt)
         return
     imageio = film_writer()
-    # The warning is harmless here: the fork starts ffmpeg at once and runs no JAX.
-    warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
     every = max(1, round(1.0 / (FPS * dt)))
-    with imageio.get_writer(str(path), fps=round(1.0 / (every * dt)), macro_block_size=8) as out:
-        for picture in film(robot, trace, spans, every, dt):
-            out.append_data(picture)
+    with warnings.catch_warnings():
+        # The warning is harmless here: the fork starts ffmpeg at once and runs no JAX.
+        warnings.filterwarnings("ignore", r"os\.fork\(\) was called", RuntimeWarning)
+        fps = round(1.0 / (every * dt))
+        with imageio.get_writer(str(path), fps=fps, macro_block_size=8) as out:
+            for picture in film(robot, trace, spans, every, dt):
+                out.append_data(picture)
 
 
 def write_animation(path: Path, pictures: Iterable, seconds: float) -> None:
