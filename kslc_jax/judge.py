@@ -1,4 +1,5 @@
 """Compare a policy with all bars: python -m kslc_jax.judge POLICY [--quick] [--json out.json]
+Compare several seeds: python -m kslc_jax.judge seed0.json seed1.json seed2.json
 
 A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fidelity: at each
 commanded speed, under random changes of the command from four starting headings (16 robots whose
@@ -8,16 +9,20 @@ that somebody else moves, and uneven ground. Prints one table: each bar,
 its required value, the worst measured value, and the condition of that value. The exit code is 0
 even if the policy misses a bar. docs/sim2sim.md describes the measurements.
 
-POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
+POLICY is a run folder, a checkpoint folder, or the name of a shipped policy. Files that --json has
+written are read instead: a table shows them side by side, and names the median. One run decides
+nothing.
 
 Examples:
   python -m kslc_jax.judge xbot_l_run --quick
   python -m kslc_jax.judge runs/laptop-seed0 --json judged.json
   python -m kslc_jax.judge runs/laptop-seed0 --seeds 32 --harsh --drake
+  python -m kslc_jax.judge judged-seed0.json judged-seed1.json judged-seed2.json
 """
 
 import contextlib
 import dataclasses
+import json
 import math
 import sys
 from collections.abc import Callable
@@ -109,8 +114,8 @@ QUICK = Size(
 class Args:
     """The policy, and the size of the measurement."""
 
-    policy: tyro.conf.Positional[Path]
-    """Run folder, checkpoint folder, or name of a shipped policy."""
+    policies: tyro.conf.Positional[tuple[Path, ...]]
+    """Run folder, checkpoint folder, or name of a shipped policy; or files of --json."""
     quick: bool = False
     """A first look: few speeds, robots and seconds."""
     seeds: int | None = None
@@ -129,7 +134,18 @@ class Args:
 
     def __post_init__(self):
         require_seed(self.seed)
+        if not self.policies:
+            raise ConfigError("policies: name a policy, or files of --json")
+        if not self.stored and len(self.policies) > 1:
+            raise ConfigError(
+                "policies: judge one at a time, each with --json; then name those files to compare"
+            )
         evaluate.check(self.size.speeds, self.size.seeds, self.size.seconds)
+
+    @property
+    def stored(self) -> bool:
+        """True if all are files of earlier judgements."""
+        return all(path.suffix == ".json" for path in self.policies)
 
     @property
     def size(self) -> Size:
@@ -301,10 +317,43 @@ def table(found: list[Bar], title: str):
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return cli.run(lambda: _report(cli.parse("judge", Args, argv, __doc__)))
+    return cli.run(lambda: _run(cli.parse("judge", Args, argv, __doc__)))
 
 
-def _report(args: Args) -> None:
+def _run(args: Args) -> None:
+    if args.stored:
+        tables.console().print(side_by_side({path.stem: read(path) for path in args.policies}))
+    else:
+        _report(args, args.policies[0])
+
+
+def read(path: Path) -> list[Bar]:
+    """The bars of a file of --json. ConfigError if there is none, or if it has no bars."""
+    try:
+        return [Bar(**bar) for bar in json.loads(path.read_text())["bars"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is no file of a finished judge --json") from error
+
+
+def side_by_side(judged: dict[str, list[Bar]]):
+    """The worst values of several policies as a rich table, the best policy first."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    names = bars_lib.ranked(judged)
+    median = names[len(names) // 2]
+    missed = sum(not bar.met for bar in judged[median])
+    caption = f"median: {median}, which misses {missed} of {len(judged[median])} bars. *: missed"
+    out = Table("bar", "wanted", *map(escape, names), caption=caption, caption_justify="left")
+    by_name = {name: {bar.name: bar for bar in judged[name]} for name in names}
+    for bar in judged[names[0]]:
+        found = [by_name[name].get(bar.name) for name in names]
+        cells = ["-" if one is None else one.shown() + "*" * (not one.met) for one in found]
+        out.add_row(escape(bar.name), bar.wanted, *cells)
+    return out
+
+
+def _report(args: Args, path: Path) -> None:
     """Measures the policy, prints the table, writes the numbers."""
     from rich.progress import Progress
 
@@ -315,11 +364,11 @@ def _report(args: Args) -> None:
     files.require_writable(args.json)
     simulator = "drake" if args.drake else "mujoco"
     sim2sim.simulator(simulator)  # fails now if its package is missing
-    policy = load_policy(args.policy)
+    policy = load_policy(path)
     robot = physics.robot_for(trials.engine(policy, "high"))
     sim2sim.require(simulator, robot)
     size, factors = args.size.for_robot(robot), similar.factors(robot)
-    about: Results = {"policy": policy_name(args.policy), "step": policy.step, "quick": args.quick}
+    about: Results = {"policy": policy_name(path), "step": policy.step, "quick": args.quick}
     about |= {"seed": args.seed, "size": dataclasses.asdict(size)}
 
     def keep(found: Results) -> None:
@@ -342,7 +391,7 @@ def _report(args: Args) -> None:
 
         found = measure(size, args, policy, progress, keep_part)
     against = bars(found, factors[SPEED], arms=bool(robot.is_arm.any()))
-    screen.print(table(against, f"{args.policy}, train step {policy.step}"))
+    screen.print(table(against, f"{path}, train step {policy.step}"))
     keep(found | {"bars": [dataclasses.asdict(one) for one in against]})
 
 

@@ -1,6 +1,8 @@
 """The package with another robot: the biped of tests/data, without arms and with other names."""
 
 import dataclasses
+import json
+import runpy
 import shutil
 import subprocess
 import sys
@@ -21,6 +23,7 @@ from kslc_jax import (
     contract,
     curriculum,
     env,
+    export,
     fingerprint,
     gait,
     networks,
@@ -378,6 +381,43 @@ def test_the_exported_model_is_the_robots(biped, untrained):
     data = contract.metadata(untrained)
     np.testing.assert_allclose(data["default_joint_pos"], biped.default_qpos[7:])
     assert sum(c["width"] for c in data["frame"]) == 38
+
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def test_the_runner_repeats_the_golden_trace(setup, tmp_path):
+    """The biped's home pose is not zero, and its actions are as large as a trained policy's."""
+    pytest.importorskip("onnxruntime", reason="the extra 'export' is not installed")
+    network = dataclasses.replace(setup.network, init_mean=1.0)
+    loud = dataclasses.replace(setup, network=network)
+    params = networks.init(loud, jax.random.key(0))
+    made = policy.Policy(loud, params, curriculum.init(loud), 0)
+    out, trace = tmp_path / "policy.onnx", contract.golden(made, 1.0)
+    assert np.nanmax(np.abs(trace["action"])) > 0.3 and trace["steps"].min() > 20
+    out.write_bytes(export.to_onnx(made))
+    out.with_suffix(".json").write_text(json.dumps(contract.metadata(made)))
+    np.savez(out.with_suffix(".npz"), **trace)
+    check = runpy.run_path(str(EXAMPLES / "check_trace.py"))["first_difference"]
+    runner = runpy.run_path(str(EXAMPLES / "onnx_runner.py"))["Controller"]
+    assert check(runner, str(out), 1e-4) is None
+
+
+@pytest.mark.slow(reason="each robot compiles its own train step")
+@pytest.mark.parametrize("name", sorted(description.known()))
+def test_every_shipped_robot_learns_for_two_train_steps(name):
+    try:
+        description.read(name)
+    except RobotError as error:
+        pytest.skip(str(error))
+    init, step = train_step.make(similar.preset("debug", name))
+    first = init()
+    before = jax.tree.map(np.array, first.learner.params)
+    state, _ = step(first)
+    state, metrics = step(state)
+    assert float(metrics["finite"]) == 1.0 and float(metrics["broken"]) == 0.0
+    moved = jax.tree.map(lambda a, b: not np.array_equal(a, b), before, state.learner.params)
+    assert all(jax.tree.leaves(moved))
 
 
 # --------------------------------------------------------------------------------- command line

@@ -1,11 +1,14 @@
 """Behaviour of all commands: one line for an error, its exit code, process-wide settings."""
 
+import json
 import logging
 import math
 import os
+import subprocess
 import sys
 
 import jax
+import numpy as np
 import pytest
 
 from kslc_jax import cli, compare, doctor, physics, robot, runtime, train
@@ -122,6 +125,32 @@ def test_variables_that_change_numbers_are_overridden(monkeypatch, capsys):
     assert not set(NUMERICS) & set(os.environ)
     runtime.prepare(gl=False)
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.slow(reason="eight processes; with mjx they compile for minutes")
+@pytest.mark.parametrize("engine", ["mujoco", "mjx"])
+def test_commands_compute_the_same_under_these_variables(engine, tmp_path):
+    """A training, its evaluation at both fidelities, and the golden trace of its export."""
+
+    def numbers(name: str, variables: dict[str, str]):
+        run, env = tmp_path / name / "run", {**os.environ, **variables}
+        short = ["--speeds", "1", "--seeds", "2", "--seconds", "3", "--json"]
+        for argv in (
+            ["train", "--preset", "debug", "--physics.engine", engine, "--run-dir", run],
+            ["evaluate", run, *short, run / "evaluate.json"],
+            ["sim2sim", run, *short, run / "sim2sim.json"],
+            ["export", run, run / "policy.onnx"],
+        ):
+            words = [sys.executable, "-m", f"kslc_jax.{argv[0]}", *map(str, argv[1:])]
+            subprocess.run(words, env=env, check=True, capture_output=True)
+        rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+        clock = {"seconds", "steps_per_second"}
+        rows = [{k: v for k, v in row.items() if k not in clock} for row in rows]
+        found = [json.loads((run / f"{x}.json").read_text()) for x in ("evaluate", "sim2sim")]
+        with np.load(run / "policy.npz") as trace:
+            return rows, found, {k: trace[k].tobytes() for k in trace}
+
+    assert numbers("plain", {}) == numbers("changed", NUMERICS)
 
 
 def test_a_user_without_a_home_folder_has_no_cache(monkeypatch):

@@ -750,6 +750,22 @@ class TestFullDisk:
         assert steps_of(disk) == list(range(1, 9))
         assert Store(disk).steps()[-1] == 8
 
+    def test_the_last_save_fails(self, training, disk, capsys):
+        """One line, and the checkpoint before stays."""
+        shutil.rmtree(training.dir, ignore_errors=True)
+        training.dir.symlink_to(disk)
+
+        def poison(state):
+            if int(state.step) == 7:
+                with (disk / "filler").open("wb") as file, contextlib.suppress(OSError):
+                    file.write(bytes(2**20))
+            return state
+
+        training.saved_at = (4,)
+        assert training(poison, "--run.keep", 1) == 2
+        assert "could not save" in the_error(capsys)
+        assert Store(disk).steps()[-1] == 4
+
     def test_metrics_are_completed_when_there_is_room_again(self, tmp_path):
         said, record = [], {"step": 1, "env_steps": 1, "x": 0.5}
         file = MetricsFile(tmp_path, warn=said.append)

@@ -106,7 +106,7 @@ def test_harsh_conditions_are_tried_as_named(monkeypatch):
 
     monkeypatch.setattr(measuring, "measure", measure)
     policy = policy_lib.load_policy("xbot_l_run")
-    args = judge.Args(Path("p"), harsh=True)
+    args = judge.Args((Path("p"),), harsh=True)
     found = judge._harsh(judge.FULL, args, policy, lambda name, share: None)
     assert [name for name in found] == list(HARSH) and found["punch=300"]["wanted"] == 0.95
     punched, held, rough, waves, slope = (setting for setting, _, _ in seen)
@@ -207,7 +207,30 @@ def test_the_robots_of_the_schedules_differ_in_more_than_their_base():
     assert not drawn.push_seconds and drawn.punch == (0.0, 0.0) and not drawn.held_arms
 
 
+def test_seeds_side_by_side(tmp_path, capsys):
+    """One seed meets all bars, the median misses one by 5 %, the other seed by 100 %."""
+    worse = {"a": {}, "b": {"lateral_std": 0.2}, "c": {"lateral_std": 0.105}}
+    for name, changes in worse.items():
+        results = good()
+        results["speeds"][2] |= changes
+        kept = [dataclasses.asdict(bar) for bar in bars(results)]
+        (tmp_path / f"{name}.json").write_text(json.dumps({"bars": kept}))
+    assert judge.main([str(tmp_path / f"{name}.json") for name in "bac"]) == 0
+    shown = capsys.readouterr().out
+    assert "median: c, which misses 1 of 13 bars" in shown
+    assert shown.index(" a ") < shown.index(" c ") < shown.index(" b ")
+    assert "0.105*" in shown and "0.2*" in shown
+    (tmp_path / "a.json").write_text("{}")
+    assert judge.main([str(tmp_path / "a.json")]) == 2
+    assert "no file of a finished judge --json" in capsys.readouterr().err
+
+
 def test_errors_are_one_line(capsys):
-    for argv in (["no-such-policy"], ["xbot_l_run", "--seconds", "2.5"]):
+    for argv in (
+        ["no-such-policy"],
+        ["xbot_l_run", "--seconds", "2.5"],
+        ["xbot_l_run", "other"],
+        [],
+    ):
         assert judge.main(argv) == 2
         assert capsys.readouterr().err.count("\n") == 1

@@ -100,6 +100,27 @@ def bars(results: dict[str, Any], scale: float = 1.0, arms: bool = True) -> list
     return found
 
 
+def ranked(judged: dict[str, list[Bar]]) -> list[str]:
+    """Names of judged policies, the best first.
+
+    The number of missed bars decides, then the sum of what the policy misses them by, each as a
+    share of its bound. A bar without a measured value counts as missed by 1.
+    """
+
+    def miss(bar: Bar) -> float:
+        if bar.met:
+            return 0.0
+        if bar.value is None:
+            return 1.0
+        bound = float(bar.wanted.split()[1])
+        return abs(bar.value - bound) / abs(bound)
+
+    def place(name: str) -> tuple[int, float]:
+        return sum(not bar.met for bar in judged[name]), sum(map(miss, judged[name]))
+
+    return sorted(judged, key=place)
+
+
 def scaled(speed: float, scale: float) -> float:
     """A commanded speed [m/s] for a robot that moves `scale` times as fast as XBot-L."""
     return round(speed * scale, 2)

@@ -154,7 +154,11 @@ def without_joint_noise(config: Config) -> Config:
 
 
 def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> env.EnvState:
-    """A reset environment whose first frame shows the command [3]: vx, vy [m/s], heading [rad]."""
+    """A reset environment with the command [3]: vx, vy [m/s], heading [rad].
+
+    Its first frame shows the command. With `command.acceleration` the frame shows zero velocity,
+    from which the command starts.
+    """
     still = commands.standing(command[2])
     wanted = commands.with_velocity(config.command, still, jnp.append(command[:2], 0.0))
     robot = physics.robot_for(config.physics)
