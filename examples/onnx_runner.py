@@ -108,7 +108,7 @@ def motor_torque(m, target, q, dq):
 
     Near the speed limit the driving torque falls to zero. Beyond the limit the motor brakes.
     """
-    full, fall = np.array(m.effort_limit), (1 - m.torque_knee) * np.array(m.speed_limit)
+    full, fall = np.array(m.effort_limit), (1 - m.corner_speed) * np.array(m.speed_limit)
     upper, lower = (full * np.clip((m.speed_limit - s * dq) / fall, -1, 1) for s in (1, -1))
     return np.clip(m.kp * (target - q) - m.kd * dq, -lower, upper)
 

@@ -69,7 +69,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
         "kd": robot.kd.tolist(),
         "effort_limit": robot.effort_limit.tolist(),
         "speed_limit": robot.speed_limit.tolist(),
-        "torque_knee": motors.TORQUE_KNEE,
+        "corner_speed": motors.CORNER_SPEED,
         "action_scale": config.env.action_scale,
         "action_clip": config.env.action_clip,
         "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from kslc_jax.robot import Robot
 
-TORQUE_KNEE = 0.75
+CORNER_SPEED = 0.75
 """Share of the joint's speed limit above which its driving torque falls linearly.
 
 The torque is zero at the limit."""
@@ -46,7 +46,7 @@ def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):
     """
     pd = dynamics.kp * robot.kp * (target - q) - dynamics.kd * robot.kd * dq
     full = robot.effort_limit * dynamics.motor_strength
-    fall = (1.0 - TORQUE_KNEE) * robot.speed_limit
+    fall = (1.0 - CORNER_SPEED) * robot.speed_limit
     upper = full * xp.clip((robot.speed_limit - dq) / fall, -1.0, 1.0)
     lower = -full * xp.clip((robot.speed_limit + dq) / fall, -1.0, 1.0)
     return xp.clip(pd, lower, upper) - dynamics.joint_friction * xp.tanh(dq / FRICTION_SPEED)
@@ -78,7 +78,7 @@ def _speed_ahead(robot: Robot, dynamics: Any, q, dq, target, torque, xp: Any):
     start, rate = dq + (1.0 - THETA) * rate * torque, THETA * rate
     gain, kd = dynamics.kp * robot.kp, dynamics.kd * robot.kd
     full = robot.effort_limit * dynamics.motor_strength
-    slope = full / ((1.0 - TORQUE_KNEE) * robot.speed_limit)
+    slope = full / ((1.0 - CORNER_SPEED) * robot.speed_limit)
     slowest, fastest = start - rate * full, start + rate * full
 
     def on_line(torque_at_rest, slope):
