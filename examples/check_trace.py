@@ -49,7 +49,8 @@ if __name__ == "__main__":
     parser.add_argument("--program", default=Path(__file__).with_name("onnx_runner.py"))
     parser.add_argument("--tolerance", type=float, default=1e-4, help="rad")
     args = parser.parse_args()
-    for path in (args.policy, args.program, Path(args.policy).with_suffix(".npz")):
+    beside = (Path(args.policy).with_suffix(suffix) for suffix in (".npz", ".json"))
+    for path in (args.policy, args.program, *beside):
         if not Path(path).is_file():
             parser.error(f"no file '{path}'")
     controller = runpy.run_path(str(args.program))["Controller"]

@@ -24,7 +24,9 @@ class Controller:
     """
 
     def __init__(self, path, vx, vy=0.0, heading=0.0):
-        self.network = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        one = onnxruntime.SessionOptions()
+        one.intra_op_num_threads = 1  # the network is small; more threads only wait
+        self.network = onnxruntime.InferenceSession(path, one, providers=["CPUExecutionProvider"])
         text = self.network.get_modelmeta().custom_metadata_map
         if text.get("metadata_version") != "4":
             raise SystemExit(f"error: {path} has no metadata of version 4, see docs/export.md")
