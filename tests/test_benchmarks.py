@@ -211,13 +211,15 @@ def test_parts(tmp_path):
     assert seconds["physics"] > 0 and seconds["gradient steps"] > 0
 
 
-@pytest.mark.slow(reason="starts Python four times")
+@pytest.mark.slow(reason="starts Python eight times")
 def test_compile_time_and_memory(tmp_path, capsys):
     path = tmp_path / "numbers.json"
     compile_time.main(compile_time.Args(presets=("debug",), engines=("mujoco",), json=path))
     phases = json.loads(path.read_text())["seconds"]["debug, mujoco"]
     assert phases["cold"]["compile"] > phases["cold"]["first step"] > 0
     assert phases["warm"].keys() == phases["cold"].keys()
+    pair = compile_time.paired("debug", "mujoco", None, 1)["warm"]
+    assert pair["ratio"] == pair["one after the other"] / pair["in two threads"]
 
     out = tmp_path / "memory.png"
     memory.main(memory.Args("debug", (16, 4096, 2**28), (3,), out=out, json=path))

@@ -757,6 +757,9 @@ class TestFullDisk:
 
         def poison(state):
             if int(state.step) == 7:
+                patience = time.monotonic() + 60
+                while not (disk / "checkpoints" / "4").exists() and time.monotonic() < patience:
+                    time.sleep(0.05)
                 with (disk / "filler").open("wb") as file, contextlib.suppress(OSError):
                     file.write(bytes(2**20))
             return state

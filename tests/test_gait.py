@@ -124,7 +124,7 @@ def test_start_of_an_episode():
     np.testing.assert_allclose(state.clock, [0.0, 1.0])
     assert state.stance.tolist() == [True, True] and state.contact.tolist() == [False, False]
     np.testing.assert_array_equal(state.lift_z, feet)
-    for name in ("air_time", "landing", "swing_height"):
+    for name in ("air_time", "landed_air_time", "swing_height"):
         assert getattr(state, name).tolist() == [0.0, 0.0]
 
 

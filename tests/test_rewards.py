@@ -286,8 +286,8 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("feet_contact_number", KSLC, {}, 1.0),
     ("feet_contact_number", KSLC, {"stance": [True, False], "foot_contact": [True, True]}, 0.35),
     ("feet_contact_number", KSLC, {"stance": [True, False], "foot_contact": [False, True]}, -0.3),
-    ("feet_air_time", KSLC, {"landing": [0.3, 0.0]}, 0.3),
-    ("feet_air_time", KSLC, {"landing": [0.7, 0.2]}, 0.7),  # 0.5 + 0.2
+    ("feet_air_time", KSLC, {"landed_air_time": [0.3, 0.0]}, 0.3),
+    ("feet_air_time", KSLC, {"landed_air_time": [0.7, 0.2]}, 0.7),  # 0.5 + 0.2
     # sqrt(0.5) for the left foot; with the right foot in contact too, sqrt(1) more.
     (
         "foot_slip",

@@ -10,10 +10,14 @@ from kslc_jax.training import stopping
 
 @pytest.fixture(autouse=True)
 def handlers():
-    """The tests leave all handlers as they were."""
+    """No signal is ignored at first, and the tests leave all handlers as they were."""
+    found = {number: signal.signal(number, signal.SIG_DFL) for number in stopping.SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     before = {number: signal.getsignal(number) for number in stopping.SIGNALS}
     yield
     assert {number: signal.getsignal(number) for number in stopping.SIGNALS} == before
+    for number, handler in found.items():
+        signal.signal(number, handler)
 
 
 def test_first_signal_asks_second_interrupts():

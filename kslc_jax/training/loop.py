@@ -141,10 +141,11 @@ def _train(job: _Job) -> TrainState:
             job.progress.say(_nothing_to_do(job, _done(state)))
             return state
         job.progress.say(f"resumed at train step {_done(state)}; compiling the train step")
-        compiled = _compiled(job)
+        compiled = _compiled(job.step, job.like)
     else:
         job.progress.say("compiling the first state and the train step")
-        state, compiled = _first_state_and_step(job)
+        in_turn = devices.several()  # several processes must run their programs in one order
+        state, compiled = first_state_and_step(job.init, job.step, job.like, in_turn)
     seconds, need = time.monotonic() - start, memory.measured(compiled)
     needs = f", needs {memory.shown(need)}" if need else ""
     job.progress.say(f"compiled in {seconds:.0f} s{needs}; training")
@@ -158,18 +159,25 @@ def _train(job: _Job) -> TrainState:
                 back_to = _done(state)
 
 
-def _compiled(job: _Job) -> Any:
-    return job.step.lower(job.like).compile()
+def _compiled(step: Any, like: TrainState) -> Any:
+    return step.lower(like).compile()
 
 
-def _first_state_and_step(job: _Job) -> tuple[TrainState, Any]:
-    """The first state and the compiled train step. Their programs compile at the same time, in two
-    threads; several processes must run their programs in one order, so they take turns."""
-    if devices.several():
-        return job.init(), _compiled(job)
+def first_state_and_step(
+    init: Callable[[], TrainState], step: Any, like: TrainState, in_turn: bool = False
+) -> tuple[TrainState, Any]:
+    """The first state and the compiled train step.
+
+    Args:
+      init, step: of `train_step.make`.
+      like: shapes of the state.
+      in_turn: False compiles the two programs at the same time, in two threads.
+    """
+    if in_turn:
+        return init(), _compiled(step, like)
     with ThreadPoolExecutor(1) as other:
-        step = other.submit(_compiled, job)
-        return job.init(), step.result()
+        compiled = other.submit(_compiled, step, like)
+        return init(), compiled.result()
 
 
 def _go_back(job: _Job, bad: NonFiniteState, attempt: int, back_to: int) -> tuple[TrainState, int]:
