@@ -183,6 +183,7 @@ def test_devices_tell_what_the_documentation_counts(glided):
         * (actor * observations.actor_width(XBOT) + critic * observations.critic_width(XBOT)),
         "action and mean": 2 * n * t * XBOT.count,
         "velocities": 3 * n * t,
+        "distances of pairs, from which MJX takes the nearest: once per physics step": 42 * n,
         "log_prob, value, advantage, target, age, valid": 6 * n * t,
     }
     assert set(told) == {"all-gather", "all-reduce"}
