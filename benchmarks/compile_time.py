@@ -25,28 +25,10 @@ from benchmarks import timing
 START = time.perf_counter()
 
 
-def once(preset_name: str, engine: str, num_envs: int | None) -> dict[str, float]:
-    """Seconds of each phase of a start, in this process."""
-    from kslc_jax import train_step
-    from kslc_jax.config import preset
-
-    marks = {"import": time.perf_counter()}
-    config = timing.on_engine(timing.resized(preset(preset_name), num_envs), engine)
-    init, step = train_step.make(config)
-    state = init()
-    marks["initial state"] = time.perf_counter()
-    lowered = step.lower(state)
-    marks["trace"] = time.perf_counter()
-    compiled = lowered.compile()
-    marks["compile"] = time.perf_counter()
-    float(compiled(state)[1]["reward"])
-    marks["first step"] = time.perf_counter()
-    starts = [START, *marks.values()]
-    return {name: marks[name] - begun for name, begun in zip(marks, starts, strict=False)}
-
-
-def in_two_threads(preset_name: str, engine: str, num_envs: int | None) -> dict[str, float]:
-    """The same for a start as a training does it."""
+def once(
+    preset_name: str, engine: str, num_envs: int | None, threads: bool = False
+) -> dict[str, float]:
+    """Seconds of each phase of a start, in this process. With `threads` it starts as a training."""
     import jax
 
     from kslc_jax import train_step
@@ -56,9 +38,16 @@ def in_two_threads(preset_name: str, engine: str, num_envs: int | None) -> dict[
     marks = {"import": time.perf_counter()}
     config = timing.on_engine(timing.resized(preset(preset_name), num_envs), engine)
     init, step = train_step.make(config)
-    like = jax.eval_shape(init)
-    state, compiled = loop.first_state_and_step(init, step, like)
-    marks["state, trace and compile"] = time.perf_counter()
+    if threads:
+        state, compiled = loop.first_state_and_step(init, step, jax.eval_shape(init))
+        marks["state, trace and compile"] = time.perf_counter()
+    else:
+        state = init()
+        marks["initial state"] = time.perf_counter()
+        lowered = step.lower(state)
+        marks["trace"] = time.perf_counter()
+        compiled = lowered.compile()
+        marks["compile"] = time.perf_counter()
     float(compiled(state)[1]["reward"])
     marks["first step"] = time.perf_counter()
     starts = [START, *marks.values()]
@@ -120,8 +109,7 @@ class Args:
 def main(args: Args) -> None:
     """Prints a table."""
     if args.here:
-        start = in_two_threads if args.threads else once
-        print(json.dumps(start(args.presets[0], args.engines[0], args.num_envs)))
+        print(json.dumps(once(args.presets[0], args.engines[0], args.num_envs, args.threads)))
         return
     results = {}
     for name in args.presets:

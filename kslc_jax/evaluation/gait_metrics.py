@@ -77,12 +77,12 @@ def speed(trace: Trace, command: float, dt: float) -> dict[str, float]:
         "forward_rmse": float(np.sqrt(np.mean((mean - command) ** 2))),
     }
     s = _steady(trace, dt)
-    if upright.any() and command == 0.0:
-        way = np.asarray(s.qpos)[-1, ..., :2] - np.asarray(s.qpos)[0, ..., :2]
-        out["drift"] = float(np.hypot(*way.T).max() / ((len(s.qpos) - 1) * dt))
     if not upright.all():
         out["seconds_to_fall"] = float(trace.alive[:, ~upright].sum(0).mean() * dt)
     if upright.any():
+        if command == 0.0:
+            way = np.asarray(s.qpos)[-1, ..., :2] - np.asarray(s.qpos)[0, ..., :2]
+            out["drift"] = float(np.hypot(*way.T).max() / ((len(s.qpos) - 1) * dt))
         linvel, angvel = np.asarray(s.linvel), np.asarray(s.angvel)
         swings = {
             "forward_std": linvel[..., 0].std(0),
