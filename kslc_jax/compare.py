@@ -28,6 +28,7 @@ from rich.table import Table
 from kslc_jax import cli, evaluate, files, records, train
 from kslc_jax import config as config_lib
 from kslc_jax.config import XBOT_L, Config, ConfigError, Fidelity
+from kslc_jax.evaluation import options
 from kslc_jax.training import stopping
 
 WIDTH = 200
@@ -82,7 +83,7 @@ class Args:
         for name in ("seeds", "ablation_seeds"):
             for seed in getattr(self, name):
                 config_lib.require_seed(seed, name)
-        evaluate.check(self.speeds, self.trials, evaluate.Args.seconds)
+        options.check_trials(self.speeds, self.trials, evaluate.Args.seconds)
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,8 @@ confidence intervals; --json writes the numbers to a file.
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 """
 
-import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,18 +18,12 @@ import tyro
 from rich.progress import Progress
 
 from kslc_jax import cli, files
-from kslc_jax.config import ConfigError, Fidelity, require_seed
-from kslc_jax.evaluation import perturbations
+from kslc_jax.config import Fidelity, require_seed
+from kslc_jax.evaluation import options, perturbations
 from kslc_jax.evaluation.tables import console, table
 
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
-
-SHORTEST = 3.0
-"""Shortest trial [s]. Some time must remain after the robot has gathered speed."""
-
-LONGEST = 86_400.0
-"""Longest trial [s]: a day."""
 
 CONDITIONS = ("fidelity", "ground", "seeds", "seconds", "noise", "seed")
 """Options that the JSON file records."""
@@ -61,20 +54,10 @@ class Args:
     """JSON file to write the numbers to."""
 
     def __post_init__(self):
-        check(self.speeds, self.seeds, self.seconds)
+        options.check_trials(self.speeds, self.seeds, self.seconds)
         require_seed(self.seed)
         if self.ground is not None:
             perturbations.terrain(self.ground)
-
-
-def check(speeds: Sequence[float], seeds: int, seconds: float) -> None:
-    """Checks the options of the trials; ConfigError if one is out of range."""
-    if not (speeds and all(map(math.isfinite, speeds))):
-        raise ConfigError("speeds: name at least one, finite")
-    if seeds <= 0:
-        raise ConfigError("seeds must be positive")
-    if not (SHORTEST <= seconds <= LONGEST and seconds == round(seconds)):
-        raise ConfigError(f"seconds must be a whole number from {SHORTEST:g} to {LONGEST:g}")
 
 
 def sweep(

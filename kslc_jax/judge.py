@@ -32,10 +32,10 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from kslc_jax import cli, evaluate, files
+from kslc_jax import cli, files
 from kslc_jax.config import ConfigError, RandomizeConfig, require_seed
 from kslc_jax.evaluation import bars as bars_lib
-from kslc_jax.evaluation import tables
+from kslc_jax.evaluation import options, tables
 from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
 from kslc_jax.evaluation.perturbations import ALL, changes, settings
 
@@ -140,7 +140,7 @@ class Args:
             raise ConfigError(
                 "policies: judge one at a time, each with --json; then name those files to compare"
             )
-        evaluate.check(self.size.speeds, self.size.seeds, self.size.seconds)
+        options.check_trials(self.size.speeds, self.size.seeds, self.size.seconds)
 
     @property
     def stored(self) -> bool:
@@ -279,12 +279,11 @@ def _tried(
 
 
 def _drake(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
-    from kslc_jax import sim2sim
     from kslc_jax.evaluation import trials
     from kslc_jax.evaluation.measure import measure as measured
 
     setting = trials.Setting(
-        trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=sim2sim.simulator("drake")
+        trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=options.simulator("drake")
     )
     speeds = [speed for speed in size.speeds if speed <= size.top]
     return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
@@ -357,16 +356,16 @@ def _report(args: Args, path: Path) -> None:
     """Measures the policy, prints the table, writes the numbers."""
     from rich.progress import Progress
 
-    from kslc_jax import physics, sim2sim, similar
+    from kslc_jax import physics, similar
     from kslc_jax.evaluation import trials
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
-    simulator = "drake" if args.drake else "mujoco"
-    sim2sim.simulator(simulator)  # fails now if its package is missing
+    engine = "drake" if args.drake else "mujoco"
+    options.simulator(engine)  # fails now if its package is missing
     policy = load_policy(path)
     robot = physics.robot_for(trials.engine(policy, "high"))
-    sim2sim.require(simulator, robot)
+    options.require_engine(engine, robot)
     size, factors = args.size.for_robot(robot), similar.factors(robot)
     about: Results = {"policy": policy_name(path), "step": policy.step, "quick": args.quick}
     about |= {"seed": args.seed, "size": dataclasses.asdict(size)}

@@ -18,9 +18,10 @@ from typing import Any
 
 from rich.progress import Progress
 
-from kslc_jax import cli, evaluate, files
+from kslc_jax import cli, files
 from kslc_jax.cli import Paths
 from kslc_jax.config import ConfigError, Fidelity
+from kslc_jax.evaluation import options
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Args:
     def __post_init__(self):
         if not self.runs:
             raise ConfigError("name at least one run")
-        evaluate.check(self.speeds, self.seeds, self.seconds)
+        options.check_trials(self.speeds, self.seeds, self.seconds)
 
 
 def snapshots(run: Path) -> list[Path]:

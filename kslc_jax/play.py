@@ -29,10 +29,10 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from kslc_jax import cli, files, runtime, sim2sim
+from kslc_jax import cli, files, runtime
 from kslc_jax.config import ConfigError, Fidelity, RandomizeConfig, TerrainConfig, require_seed
 from kslc_jax.errors import MissingPackage
-from kslc_jax.evaluation import perturbations
+from kslc_jax.evaluation import options, perturbations
 from kslc_jax.viewer import films
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class Args:
     """Run folder, checkpoint folder, or name of a shipped policy."""
     fidelity: Fidelity = "high"
     """train: the training engine. high: full C MuJoCo at 1 ms."""
-    engine: sim2sim.Engine = "mujoco"
+    engine: options.Engine = "mujoco"
     """Physics engine of strip and video; drake is an extra (pip install 'kslc_jax[drake]')."""
     seed: int = 0
     """Seed of the initial state."""
@@ -101,7 +101,7 @@ class Args:
         if not (self.speeds and all(map(math.isfinite, self.speeds))):
             raise ConfigError("speeds: name at least one, finite")
         require_seed(self.seed)
-        perturbations.check_disturbances(self.punch, self.top)
+        options.check_disturbances(self.punch, self.top)
         if self.top is not None and self.schedule is None:
             raise ConfigError("top is the fastest command of a schedule: give --schedule too")
         videos = films.FILMS + films.ANIMATIONS
@@ -178,11 +178,11 @@ def record(args: Args, policy):
         engine,
         randomize(args),
         seconds=settle + max(1.0, np.ceil(args.shown_seconds)),
-        simulate=sim2sim.simulator(args.engine),
+        simulate=options.simulator(args.engine),
         schedule=schedule,
     )
     robot = physics.robot_for(engine)
-    sim2sim.require(args.engine, robot)
+    options.require_engine(args.engine, robot)
     trials.require(setting, robot)
     trace = trials.join(list(trials.run(policy, setting, velocities, args.seed)))
     start = round(settle / engine.control_dt)
@@ -261,7 +261,7 @@ def _play(args: Args) -> None:
     runtime.choose_gl()  # before anything that imports mujoco
     for path in (args.gait_strip, args.video):
         files.require_writable(path)
-    sim2sim.simulator(args.engine)  # fails now if the engine's package is missing
+    options.simulator(args.engine)  # fails now if the engine's package is missing
     from kslc_jax.policy import load_policy
 
     draw(args, load_policy(args.policy))

@@ -32,7 +32,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import tyro
 from rich.console import Console
@@ -40,14 +40,12 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from kslc_jax import cli, evaluate, files
+from kslc_jax import cli, files
 from kslc_jax.config import ConfigError, PhysicsConfig, require_seed
-from kslc_jax.errors import MissingPackage
-from kslc_jax.evaluation import tables
+from kslc_jax.evaluation import options, tables
 from kslc_jax.evaluation.perturbations import (
     ALL,
     changes,
-    check_disturbances,
     disturbed,
     settings,
     terrain,
@@ -57,8 +55,6 @@ if TYPE_CHECKING:
     from kslc_jax.evaluation.trials import Setting
     from kslc_jax.policy import Policy
     from kslc_jax.robot import Robot
-
-Engine = Literal["mujoco", "drake"]
 
 MOST_LATENCY = 50
 """Largest delay of the actions [control steps]."""
@@ -74,7 +70,7 @@ class Args:
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
-    engine: Engine = "mujoco"
+    engine: options.Engine = "mujoco"
     """mujoco: C MuJoCo on all cores. drake: one robot at a time, slow; it needs the package drake
     (pip install 'kslc_jax[drake]')."""
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
@@ -124,7 +120,7 @@ class Args:
     """JSON file to write the numbers to."""
 
     def __post_init__(self):
-        evaluate.check(self.speeds, self.seeds, self.seconds)
+        options.check_trials(self.speeds, self.seeds, self.seconds)
         require_seed(self.seed)
         if not all(map(math.isfinite, (self.sideways, self.turn))):
             raise ConfigError("sideways and turn must be finite")
@@ -132,7 +128,7 @@ class Args:
             raise ConfigError("heading: name at least one, finite")
         if not 0 <= self.latency <= MOST_LATENCY:
             raise ConfigError(f"latency must lie in 0 to {MOST_LATENCY} control steps")
-        check_disturbances(self.punch, self.top)
+        options.check_disturbances(self.punch, self.top)
         for ground in self.ground:
             terrain(ground)
         for name in self.conditions:
@@ -156,29 +152,6 @@ def named(args: Args, robot: "Robot") -> tuple[str, ...]:
     return tuple(c for name in args.perturb for c in (every if name == "all" else (name,)))
 
 
-def require(engine: Engine, robot: "Robot") -> None:
-    """ConfigError if the engine cannot take over the robot."""
-    if engine == "drake":
-        from kslc_jax.evaluation import drake
-
-        drake.require_plain(robot)
-
-
-def simulator(engine: Engine):
-    """The value of `trials.Setting.simulate` for an engine: None for MuJoCo.
-
-    Raises:
-      MissingPackage: the engine is not installed.
-    """
-    if engine == "mujoco":
-        return None
-    try:
-        from kslc_jax.evaluation import drake
-    except ImportError as error:
-        raise MissingPackage(f"{error}; try: pip install 'kslc_jax[drake]'") from error
-    return drake.step
-
-
 def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
     """The setting of the trials under one condition."""
     from kslc_jax.evaluation import trials
@@ -192,7 +165,7 @@ def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
         noise=args.noise,
         latency=args.latency,
         heading=args.heading[0],
-        simulate=simulator(args.engine),
+        simulate=options.simulator(args.engine),
     )
     randomize = disturbed(plain.randomize, args.punch, args.hold_arms)
     return dataclasses.replace(plain, **settings(made, randomize))
@@ -274,7 +247,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def _report(args: Args) -> None:
     """Tries the policy under all conditions, prints the tables, writes the numbers."""
-    simulator(args.engine)  # fails now if the engine's package is missing
+    options.simulator(args.engine)  # fails now if the engine's package is missing
     from kslc_jax import physics
     from kslc_jax.evaluation import schedules, trials
     from kslc_jax.policy import load_policy, policy_name
@@ -284,7 +257,7 @@ def _report(args: Args) -> None:
     engine = trials.engine(policy, "high")
     robot = physics.robot_for(engine)
     args = dataclasses.replace(args, perturb=named(args, robot))
-    require(args.engine, robot)  # what is impossible fails before any trial
+    options.require_engine(args.engine, robot)  # what is impossible fails before any trial
     for condition in args.conditions:
         trials.require(setting(args, engine, condition), robot)
     for name in args.schedule:

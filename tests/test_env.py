@@ -217,7 +217,7 @@ def test_jit_equals_no_jit_and_batch_of_one():
     """The tolerance is 1e-4, because fused float32 programs add in another order."""
     config = preset("debug")
     cur = curriculum.init(config)
-    state = env.reset(config, jax.random.key(0), cur)
+    state = jax.jit(lambda key: env.reset(config, key, cur))(jax.random.key(0))
     args = state, 0.1 * jnp.ones(16), jax.random.key(1)
     plain = env.step(config, *args, cur)
     jitted = jax.jit(lambda s, a, k: env.step(config, s, a, k, cur))(*args)

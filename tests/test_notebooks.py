@@ -105,6 +105,7 @@ def test_train_and_evaluate(execute, tmp_path):
     assert pictures(notebook) == 3
 
 
+@pytest.mark.slow(reason="a quarter of a minute")
 def test_rewards_and_curriculum(execute):
     """The printed numbers equal the formulas worked out by hand."""
     notebook = execute("03_rewards_and_curriculum")

@@ -13,13 +13,21 @@ import numpy as np
 import pytest
 
 from kslc_jax import fingerprint
-from kslc_jax.robots import anatomy, build, capsules, contacts, description
+from kslc_jax.robots import anatomy, build, capsules, contacts, description, shapes
 from kslc_jax.robots.description import RobotError
 
 DATA = Path(__file__).parent / "data"
 BIPED = str(DATA / "biped.toml")
 SHIPPED = [name for name in description.known() if name != "xbot_l"]
 FIDELITIES = ("train", "high")
+
+DRAWN = """<mujoco><worldbody>
+<geom type="plane" size="1 1 1"/>
+<geom type="plane" size="1 1 1" group="5"/>
+<body><geom size="1"/><geom size="1" group="2"/><geom size="1" group="3"/>
+  <body><geom size="1" group="3"/><geom size="1" group="4" rgba="1 1 1 0"/></body>
+  <body/>
+</body></worldbody></mujoco>"""
 
 # Digests of the model before robots had descriptions; "more" and "options": of the fields below.
 XBOT_L = {
@@ -594,3 +602,14 @@ def test_mjcf_in_a_package(tmp_path):
 def test_robots_need_no_jax():
     code = "import sys, kslc_jax.robots.build; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_pictures_show_every_link_that_has_a_shape():
+    """Of the first link, group 3 stays hidden. The second link has nothing but such shapes."""
+    assert shapes.drawn(mujoco.MjModel.from_xml_string(DRAWN)) == [0, 2, 3, 5]
+
+
+@pytest.mark.parametrize("name", ["xbot_l", BIPED])
+def test_pictures_show_what_mujocos_viewer_shows(name):
+    high = model(name, "high")
+    assert shapes.drawn(high) == np.flatnonzero(high.geom_group <= 2).tolist()

@@ -117,6 +117,7 @@ def test_stop_and_resume_is_bit_for_bit_the_uninterrupted_run(whole, tmp_path):
         np.testing.assert_array_equal(x, y)
 
 
+@pytest.mark.slow(reason="writing three profiles takes a quarter of a minute")
 def test_profile_changes_no_number(whole, tmp_path):
     """A profile has two train steps, from the second step on. If the run ends early, the profile
     has the steps so far."""
@@ -166,7 +167,7 @@ def test_killed_run_resumes_with_the_same_numbers(sig, tmp_path):
         stderr=subprocess.PIPE,
         text=True,
     )
-    wait_for(run_dir / "metrics.jsonl", 20, process)
+    wait_for(run_dir / "metrics.jsonl", 6, process)
     process.send_signal(sig)
     out, _ = process.communicate(timeout=60)
     killed = sig == signal.SIGKILL

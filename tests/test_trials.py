@@ -28,7 +28,13 @@ def still():
     return policy_lib.Policy(config, params, curriculum.init(config), 0)
 
 
-@pytest.mark.parametrize("physics", [C_MUJOCO, HighFidelity()])
+@pytest.mark.parametrize(
+    "physics",
+    [
+        HighFidelity(),
+        pytest.param(C_MUJOCO, marks=pytest.mark.slow(reason="compiles, like high fidelity")),
+    ],
+)
 def test_servos_alone_stand_a_second_and_then_fall(still, physics):
     """Bare servos fall after about two seconds at either fidelity; what fell stays fallen."""
     setting = trials.Setting(physics, seconds=5.0)

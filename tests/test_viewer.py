@@ -73,6 +73,7 @@ def test_pacer_forgets_what_it_cannot_make_up_for():
     assert pacer.due(75.0, 0.0) == 0 and pacer.due(75.02, 1.0) == 2
 
 
+@pytest.mark.slow(reason="compiles two programs; with a schedule the quick suite compares the same")
 def test_a_session_is_a_trial(still):
     """With the same start, command and policy, the motion equals that of `trials.run`."""
     command = np.array([0.3, 0.1, 0.2])

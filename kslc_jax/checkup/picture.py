@@ -68,8 +68,10 @@ def _view(axis: Axes, robot: Robot, data: mujoco.MjData, view: str) -> None:
     """Draws one view."""
     right, towards = VIEWS[view]
     flat = np.stack([right, [0.0, 0.0, 1.0]], axis=1)  # world -> picture: points @ flat
-    for geom in sorted(_drawn(robot), key=lambda geom: data.geom_xpos[geom] @ towards):
-        points = shapes.points(robot.mj_model, geom) @ data.geom_xmat[geom].reshape(3, 3).T
+    model = robot.mj_model
+    own = [geom for geom in shapes.drawn(model) if model.geom_bodyid[geom]]
+    for geom in sorted(own, key=lambda geom: data.geom_xpos[geom] @ towards):
+        points = shapes.points(model, geom) @ data.geom_xmat[geom].reshape(3, 3).T
         axis.add_patch(
             Polygon(
                 _outline((points + data.geom_xpos[geom]) @ flat),
@@ -90,15 +92,6 @@ def _view(axis: Axes, robot: Robot, data: mujoco.MjData, view: str) -> None:
     axis.margins(0.12, 0.05)
     axis.grid(alpha=0.25)
     axis.set_xlabel("y [m], its left" if right[1] else "x [m], forward")
-
-
-def _drawn(robot: Robot) -> list[int]:
-    """Geoms that viewers show; of a body without such, all."""
-    model = robot.mj_model
-    shown = (model.geom_group < 3) & (model.geom_bodyid > 0)
-    seen = set(model.geom_bodyid[shown].tolist())
-    bodies = model.geom_bodyid.tolist()
-    return [g for g, body in enumerate(bodies) if body and (shown[g] or body not in seen)]
 
 
 def _outline(points: np.ndarray) -> np.ndarray:

@@ -94,14 +94,6 @@ def scaled(condition: str, factors: dict[str, float]) -> str:
     return f"{name}{between}{float(f'{float(value) * factor:.2g}'):g}"  # 150, not 1.5e+02
 
 
-def check_disturbances(punch: float, top: float | None) -> None:
-    """ConfigError if the force of punches [N] or the top speed of schedules [m/s] is wrong."""
-    if not (math.isfinite(punch) and punch >= 0):
-        raise ConfigError("punch must be a force in newtons, not negative")
-    if top is not None and not (math.isfinite(top) and top > 0):
-        raise ConfigError("top must be a positive speed")
-
-
 def disturbed(randomize: RandomizeConfig, punch: float, hold_arms: bool) -> RandomizeConfig:
     """`randomize` with punches of `punch` [N], and with arms that follow random targets."""
     return dataclasses.replace(randomize, punch=(punch, punch), held_arms=float(hold_arms))

@@ -130,9 +130,7 @@ def engine(
 def require(setting: Setting, robot: Robot) -> None:
     """ConfigError if the robot cannot have the setting's conditions."""
     randomize.require_trunk(setting.randomize, robot)
-    variation.require(setting.variation, robot)
-    if setting.randomize.held_arms and not robot.is_arm.any():
-        raise ConfigError(f"held arms: {robot.name} has no arms")
+    variation.require(setting.randomize, setting.variation, robot)
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:

@@ -1,8 +1,7 @@
 """Differences of one robot from its description that training does not have in this form.
 
 These are heavier hands, soles whose contact area changes all the time, and friction and damping of
-each joint.
-All of them change fields of the mjModel, see `physics.step`.
+each joint. All of them change fields of the mjModel, see `physics.step`.
 """
 
 import functools
@@ -16,7 +15,7 @@ import mujoco
 import numpy as np
 
 from kslc_jax import similar
-from kslc_jax.config import ConfigError
+from kslc_jax.config import ConfigError, RandomizeConfig
 from kslc_jax.evaluation import perturbations
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
@@ -51,22 +50,23 @@ def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
 
 def _possible(changes: dict[str, Any], robot: Robot) -> bool:
     """True if the robot can have the `perturbations.changes` of a condition."""
-    if "held_arms" in changes and not robot.is_arm.any():
-        return False
-    return not _lacking(changes.get("variation", Variation()), robot)
+    made = perturbations.settings(changes, RandomizeConfig())
+    return not _lacking(made["randomize"], made.get("variation", Variation()), robot)
 
 
-def require(variation: Variation, robot: Robot) -> None:
-    """ConfigError if the robot cannot have the variation.
+def require(randomize: RandomizeConfig, variation: Variation, robot: Robot) -> None:
+    """ConfigError if the robot lacks a part that the changes need.
 
-    `hands` needs arms; `sole` needs feet that are boxes.
+    `hands` and held arms need arms; `sole` needs feet that are boxes.
     """
-    if lacking := _lacking(variation, robot):
+    if lacking := _lacking(randomize, variation, robot):
         raise ConfigError(f"{lacking}; leave it out")
 
 
-def _lacking(variation: Variation, robot: Robot) -> str:
-    """The reason why the robot cannot have the variation; empty if it can."""
+def _lacking(randomize: RandomizeConfig, variation: Variation, robot: Robot) -> str:
+    """The reason why the robot cannot have the changes; empty if it can."""
+    if randomize.held_arms and not robot.is_arm.any():
+        return f"held arms: {robot.name} has no arms"
     if variation.sole and min(_foot_boxes(robot)) < 0:
         return f"sole: the feet of {robot.name} are no boxes"
     if variation.hands and not len(robot.hand_body_ids):

@@ -14,6 +14,9 @@ _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH = (
 NEAR = 0.001
 """Distance [m] up to which two shapes are measured."""
 
+SHOWN_GROUP = 2
+"""Highest geom group that MuJoCo's own viewer shows."""
+
 _KINDS = (_SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX, _MESH)
 
 
@@ -35,6 +38,18 @@ def collides(model: mujoco.MjModel) -> np.ndarray:
     touching = (model.geom_contype | model.geom_conaffinity) > 0
     touching[np.union1d(model.pair_geom1, model.pair_geom2).astype(int)] = True
     return touching
+
+
+def drawn(model: mujoco.MjModel) -> list[int]:
+    """Ids of the geoms that pictures show.
+
+    They are those that MuJoCo's own viewer shows. A link without such a geom shows all of its own:
+    many MJCFs have shapes for collisions only, in a group that is hidden.
+    """
+    visible = model.geom_rgba[:, 3] > 0
+    shown = visible & (model.geom_group <= SHOWN_GROUP)
+    bare = ~np.isin(model.geom_bodyid, model.geom_bodyid[shown]) & (model.geom_bodyid > 0)
+    return np.flatnonzero(shown | (bare & visible)).tolist()
 
 
 def surface(source: Source, geoms: list[int]) -> np.ndarray:

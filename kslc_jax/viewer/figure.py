@@ -10,14 +10,12 @@ from trimesh.exchange.gltf import export_glb
 from kslc_jax import ground as ground_lib
 from kslc_jax.ground import Ground
 from kslc_jax.robot import Robot
+from kslc_jax.robots.shapes import drawn
 from kslc_jax.viewer import shapes
 from kslc_jax.viewer.session import View
 
 CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
 """Start position and target of the camera, relative to the robot [m]; field of view [degrees]."""
-
-SHOWN_GROUP = 2
-"""Highest geom group that is drawn, as in MuJoCo's own viewer."""
 
 GROUND_COLORS = ((226, 229, 233), (178, 184, 194))
 """The two colours of uneven ground: red, green, blue."""
@@ -48,11 +46,9 @@ class Figure:
         self._world = scene.add_frame("/world", show_axes=False)
         self._bodies = {}
         self._windows: list[viser.GlbHandle] = []
-        for geom in range(model.ngeom):
+        for geom in drawn(model):
             body = int(model.geom_bodyid[geom])
             link = model.body(body).name
-            if model.geom_group[geom] > SHOWN_GROUP:
-                continue
             if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
                 self._add_floor(scene)
                 continue

@@ -3,10 +3,9 @@
 Call `runtime.prepare()` before you import anything that imports mujoco: it chooses the GL library.
 """
 
-import contextlib
 import copy
 import os
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import jax
@@ -19,6 +18,7 @@ from kslc_jax.config import TerrainConfig
 from kslc_jax.errors import MissingPackage
 from kslc_jax.ground import Ground
 from kslc_jax.robot import Robot
+from kslc_jax.robots import shapes
 from kslc_jax.runtime import first_line
 
 if TYPE_CHECKING:
@@ -69,6 +69,14 @@ def shown_robot(policy: "Policy", terrain: TerrainConfig | None = None) -> Robot
     return robot_lib.load("high", name=policy.config.physics.robot, terrain=terrain)
 
 
+def _drawable(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy of the model in which MuJoCo's renderer shows the geoms of `shapes.drawn`, no more."""
+    copied, hidden = copy.copy(model), mujoco.mjNGROUP - 1
+    shown = np.isin(np.arange(model.ngeom), shapes.drawn(model))
+    copied.geom_group[:] = np.where(shown, 0, hidden)
+    return copied
+
+
 def put_ground(robot: Robot, model: mujoco.MjModel, ground: Ground, x: float, y: float) -> float:
     """Moves the height field of `model`, a copy of the robot's, to where a robot is.
 
@@ -106,7 +114,7 @@ def frames(
       distance: distance of the camera [m] for XBot-L; it scales with the robot's size.
       ground: [T] uneven ground, if the robot has it.
     """
-    model, size, floor = copy.copy(robot.mj_model), robot.length_ratio, 0.0
+    model, size, floor = _drawable(robot.mj_model), robot.length_ratio, 0.0
     data, cam = mujoco.MjData(model), camera(distance * size)
     with _renderer(model, height, width) as renderer:
         for i, q in enumerate(qpos):
@@ -144,7 +152,7 @@ def gait_strip(
       width, height: size of the picture [pixels].
       ground: [T] uneven ground, if the robot has it.
     """
-    model, size = copy.copy(robot.mj_model), robot.length_ratio
+    model, size = _drawable(robot.mj_model), robot.length_ratio
     shown = qpos[:: round(interval / dt)]
     middle, length = shown[:, 0].mean(), np.ptp(shown[:, 0]) + 2.0
     cam = camera(0.0, elevation=-6.0)
@@ -158,8 +166,8 @@ def gait_strip(
     cam.distance = 0.5 * max(length * height / width, tall) / half_height
     cam.lookat[:] = [middle, across, EYE_LEVEL * size + floors.mean()]
     data = mujoco.MjData(model)
-    lens = _field_of_view(model, LONG_LENS)
-    with lens, _renderer(model, height, width, max_geom=20_000) as renderer:
+    model.vis.global_.fovy = LONG_LENS
+    with _renderer(model, height, width, max_geom=20_000) as renderer:
         for i, q in enumerate(shown):
             data.qpos[:] = q
             mujoco.mj_forward(model, data)
@@ -175,16 +183,6 @@ def gait_strip(
                 renderer.scene,
             )
         return renderer.render()
-
-
-@contextlib.contextmanager
-def _field_of_view(model: mujoco.MjModel, degrees: float) -> Generator[None]:
-    """Within the context, the model's camera has this vertical field of view [degrees]."""
-    before, model.vis.global_.fovy = model.vis.global_.fovy, degrees
-    try:
-        yield
-    finally:
-        model.vis.global_.fovy = before
 
 
 def stack(pictures: Sequence[np.ndarray]) -> np.ndarray:

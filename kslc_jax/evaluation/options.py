@@ -1,0 +1,64 @@
+"""What the commands that try policies share: the engines to choose from, and checks of options.
+
+Imports no JAX, so that a command checks its arguments quickly.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, Literal
+
+from kslc_jax.config import ConfigError
+from kslc_jax.errors import MissingPackage
+
+if TYPE_CHECKING:
+    from kslc_jax.robot import Robot
+
+Engine = Literal["mujoco", "drake"]
+"""Simulators of a trial at high fidelity."""
+
+SHORTEST = 3.0
+"""Shortest trial [s]. Some time must remain after the robot has gathered speed."""
+
+LONGEST = 86_400.0
+"""Longest trial [s]: a day."""
+
+
+def simulator(engine: Engine) -> Callable[..., Any] | None:
+    """The value of `trials.Setting.simulate` for an engine: None for MuJoCo.
+
+    Raises:
+      MissingPackage: the engine is not installed.
+    """
+    if engine == "mujoco":
+        return None
+    try:
+        from kslc_jax.evaluation import drake
+    except ImportError as error:
+        raise MissingPackage(f"{error}; try: pip install 'kslc_jax[drake]'") from error
+    return drake.step
+
+
+def require_engine(engine: Engine, robot: "Robot") -> None:
+    """ConfigError if the engine cannot take over the robot."""
+    if engine == "drake":
+        from kslc_jax.evaluation import drake
+
+        drake.require_plain(robot)
+
+
+def check_trials(speeds: Sequence[float], seeds: int, seconds: float) -> None:
+    """ConfigError if the speeds [m/s], number or length [s] of the trials are out of range."""
+    if not (speeds and all(map(math.isfinite, speeds))):
+        raise ConfigError("speeds: name at least one, finite")
+    if seeds <= 0:
+        raise ConfigError("seeds must be positive")
+    if not (SHORTEST <= seconds <= LONGEST and seconds == round(seconds)):
+        raise ConfigError(f"seconds must be a whole number from {SHORTEST:g} to {LONGEST:g}")
+
+
+def check_disturbances(punch: float, top: float | None) -> None:
+    """ConfigError if the force of punches [N] or the top speed of schedules [m/s] is wrong."""
+    if not (math.isfinite(punch) and punch >= 0):
+        raise ConfigError("punch must be a force in newtons, not negative")
+    if top is not None and not (math.isfinite(top) and top > 0):
+        raise ConfigError("top must be a positive speed")
