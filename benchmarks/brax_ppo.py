@@ -54,7 +54,11 @@ class Adapter(brax.envs.Env):
     @property
     def observation_size(self) -> Any:
         frames = self.config.env.frames, self.config.env.privileged_frames
-        widths = observations.actor_width(self.robot), observations.critic_width(self.robot)
+        memory = self.config.env.critic_memory
+        widths = (
+            observations.actor_width(self.robot),
+            observations.critic_width(self.robot, memory),
+        )
         return {"state": frames[0] * widths[0], "privileged_state": frames[1] * widths[1]}
 
     @property
@@ -79,7 +83,8 @@ def _wrap(adapter: Adapter, **_: Any) -> brax.envs.Env:
 def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]:
     """Our actor and critic with Brax's interface."""
     robot = physics.robot_for(config.physics)
-    widths = observations.actor_width(robot), observations.critic_width(robot)
+    memory = config.env.critic_memory
+    widths = observations.actor_width(robot), observations.critic_width(robot, memory)
 
     def stacked(obs: jax.Array, width: int) -> jax.Array:
         return obs.reshape(*obs.shape[:-1], -1, width)

@@ -30,9 +30,11 @@ Side = Literal["brax", "purejaxrl", "torch"]
 
 
 def comparable(config: Config, **network: Any) -> Config:
-    """The config without the velocity estimator, and with other fields of the networks."""
+    """The config with other fields of the networks, and without what only we have: the velocity
+    estimator, and a critic that sees what rewards remember."""
     changed = dataclasses.replace(config.network, estimator=(), **network)
-    return dataclasses.replace(config, network=changed)
+    env = dataclasses.replace(config.env, critic_memory=False)
+    return dataclasses.replace(config, network=changed, env=env)
 
 
 def on_mjx(config: Config, repeats: int, sides: tuple[Side, ...]) -> timing.Seconds:

@@ -28,7 +28,8 @@ def _widths(config: Config) -> dict[str, int]:
     robot = physics.robot_for(config.physics)
     return {
         "policy": config.env.frames * observations.actor_width(robot),
-        "critic": config.env.privileged_frames * observations.critic_width(robot),
+        "critic": config.env.privileged_frames
+        * observations.critic_width(robot, config.env.critic_memory),
         "action": robot.count,
         "reward": 1,
         "done": 1,

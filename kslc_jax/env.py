@@ -109,7 +109,10 @@ def begin(config: Config, key: jax.Array, curriculum: Curriculum) -> EnvState:
         top_until=jnp.full((), NEVER, jnp.int32),
         history=jnp.zeros((config.env.frames, observations.actor_width(robot))),
         privileged_history=jnp.zeros(
-            (config.env.privileged_frames, observations.critic_width(robot))
+            (
+                config.env.privileged_frames,
+                observations.critic_width(robot, config.env.critic_memory),
+            )
         ),
         last_action=jnp.zeros(robot.count),
         last_last_action=jnp.zeros(robot.count),

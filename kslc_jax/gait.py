@@ -30,7 +30,7 @@ class GaitState:
     air_time: jax.Array  # [2] s in the air, 0 if grounded (see `update`)
     landed_air_time: jax.Array  # [2] s, air time that ended at this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
-    mean_velocity: jax.Array  # [2] m/s, vx, vy, base frame, mean over about one cycle
+    mean_error: jax.Array  # [2] m/s, vx, vy less the command, mean over about one cycle
     stance: jax.Array  # [2] bool, True: the clock wants this foot on the ground
     clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
 
@@ -51,7 +51,7 @@ def init(config: GaitConfig, key: jax.Array, command: Command, foot_z: jax.Array
         air_time=zeros,
         landed_air_time=zeros,
         swing_height=zeros,
-        mean_velocity=zeros,
+        mean_error=zeros,
         stance=stance,
         clock=clock,
     )
@@ -76,6 +76,7 @@ def update(
     grounded = contact | stance | state.contact
     flown = state.air_time > 0.0
     air_time = state.air_time + dt
+    error = signals.base_linvel[:2] - command.velocity[:2]
     foot_z = signals.foot_pos[:, 2]
     return GaitState(
         phase=phase,
@@ -84,8 +85,7 @@ def update(
         air_time=jnp.where(grounded, 0.0, air_time),
         landed_air_time=jnp.where(flown & grounded, air_time, 0.0),
         swing_height=foot_z - state.lift_z,
-        mean_velocity=state.mean_velocity
-        + dt / cycle_time * (signals.base_linvel[:2] - state.mean_velocity),
+        mean_error=state.mean_error + dt / cycle_time * (error - state.mean_error),
         stance=stance,
         clock=clock,
     )

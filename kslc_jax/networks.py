@@ -181,7 +181,7 @@ def _critic(config: Config) -> nn.Module:
     if not config.network.symmetric:
         return MLP(config.network.critic, 1, 1.0)
     robot = _robot(config)
-    inputs = mirrored_frame(observations.critic_table(robot), robot)
+    inputs = mirrored_frame(observations.critic_table(robot, config.env.critic_memory), robot)
     return MirrorMLP(config.network.critic, inputs, parity(np.zeros(1, int), np.ones(1)), 1.0)
 
 
@@ -191,7 +191,8 @@ def init(config: Config, key: jax.Array) -> Params:
     robot = _robot(config)
     beside = (jnp.zeros(ESTIMATED),) if config.network.estimator else ()
     history = jnp.zeros((config.env.frames, observations.actor_width(robot)))
-    privileged = jnp.zeros((config.env.privileged_frames, observations.critic_width(robot)))
+    width = observations.critic_width(robot, config.env.critic_memory)
+    privileged = jnp.zeros((config.env.privileged_frames, width))
     params = {
         "actor": _actor(config).init(key_actor, history, *beside)["params"],
         "critic": _critic(config).init(key_critic, privileged)["params"],

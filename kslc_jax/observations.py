@@ -65,13 +65,23 @@ def actor_table(robot: Robot) -> Table:
 
 
 @functools.lru_cache(maxsize=32)
-def critic_table(robot: Robot) -> Table:
+def critic_table(robot: Robot, memory: bool = False) -> Table:
     """Components of the critic's frame: 25 + 4 n values for n joints, 89 for XBot-L.
 
-    On uneven ground that the critic sees there are four more.
+    On uneven ground that the critic sees there are four more. `memory` adds six, see
+    `EnvConfig.critic_memory`.
     """
     n = robot.count
     seen = robot.terrain is not None and robot.terrain.critic_sees
+    ground = (
+        Component("foot_ground", 2, 10.0, 0.0, "swap"),
+        Component("slope", 2, 5.0, 0.0, "polar"),
+    )
+    remembered = (
+        Component("mean_error", 2, 2.0, 0.0, "polar"),
+        Component("air_time", 2, 2.0, 0.0, "swap"),
+        Component("swing_height", 2, 10.0, 0.0, "swap"),
+    )
     return (
         Component("clock", 2, 1.0, 0.0, "negate"),
         Component("command", 3, (2.0, 2.0, 1.0), 0.0, "command"),
@@ -88,9 +98,8 @@ def critic_table(robot: Robot) -> Table:
         Component("base_mass", 1, 1.0 / (MASS_SCALE * robot.mass_ratio), 0.0, "keep"),
         Component("stance", 2, 1.0, 0.0, "swap"),
         Component("contact", 2, 1.0, 0.0, "swap"),
-    ) + seen * (
-        Component("foot_ground", 2, 10.0, 0.0, "swap"),
-        Component("slope", 2, 5.0, 0.0, "polar"),
+        *(ground if seen else ()),
+        *(remembered if memory else ()),
     )
 
 
@@ -104,9 +113,9 @@ def actor_width(robot: Robot) -> int:
     return width(actor_table(robot))
 
 
-def critic_width(robot: Robot) -> int:
+def critic_width(robot: Robot, memory: bool = False) -> int:
     """Width of the critic's frame."""
-    return width(critic_table(robot))
+    return width(critic_table(robot, memory))
 
 
 def slices(table: Table) -> dict[str, slice]:
@@ -154,6 +163,9 @@ def _values(src: Sources) -> dict[str, jax.Array]:
         "base_mass": src.base_mass[None],
         "stance": src.gait.stance.astype(jnp.float32),
         "contact": s.foot_contact.astype(jnp.float32),
+        "mean_error": src.gait.mean_error,
+        "air_time": src.gait.air_time,
+        "swing_height": src.gait.swing_height,
     }
 
 
@@ -175,7 +187,7 @@ def actor_frame(config: EnvConfig, robot: Robot, src: Sources, key: jax.Array) -
 
 def critic_frame(config: EnvConfig, robot: Robot, src: Sources) -> jax.Array:
     """Critic frame [W] without noise, clipped."""
-    frame = _frame(critic_table(robot), src)
+    frame = _frame(critic_table(robot, config.critic_memory), src)
     return jnp.clip(frame, -config.observation_clip, config.observation_clip)
 
 

@@ -143,12 +143,13 @@ def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
 
 
 def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """exp(-10 |xy error of the mean velocity|), times `_exactness` (ours).
+    """exp(-10 |mean xy velocity error|), times `_exactness` (ours).
 
     The mean is over about one gait cycle. Within a stride the speed varies by more than the mean
-    error that matters.
+    error that matters. Each moment's velocity is compared with the command of that moment. A mean
+    velocity would lag behind a new command, and pay a robot to overshoot it.
     """
-    exact = jnp.exp(-10.0 * norm(x.gait.mean_velocity - x.command.velocity[:2]))
+    exact = jnp.exp(-10.0 * norm(x.gait.mean_error))
     return exact * _exactness(cfg, x)
 
 
@@ -252,16 +253,18 @@ def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Joint motion, distance from the default pose and action changes while standing (ours).
+    """Joint motion, distance from the default pose, action changes and motion of the feet while
+    standing (ours).
 
-    It is 0 while the command is to move. Action changes enter squared: exploration noise then adds
-    on average the same amount for every mean action, and does not hide that the mean itself
-    trembles. The noise is large in early training and would dominate the term. So this part grows
-    with the commanded range, see `_exactness`.
+    It is 0 while the command is to move. Action changes and foot speeds enter squared: exploration
+    noise then adds on average the same amount for every mean action, and does not hide that the
+    mean itself trembles. The noise is large in early training and would dominate the term. So these
+    two grow with the commanded range, see `_exactness`. A robot that shuffles its feet creeps.
     """
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
-    restless = cfg.restless * _exactness(cfg, x) * _action_change(x)
-    return jnp.where(x.command.moving, 0.0, moved + restless)
+    unquiet = cfg.restless * _action_change(x)
+    unquiet += cfg.shuffle * jnp.sum(jnp.square(x.signals.foot_vel))
+    return jnp.where(x.command.moving, 0.0, moved + unquiet * _exactness(cfg, x))
 
 
 # ------------------------------------------------------------------------------------- HG: effort

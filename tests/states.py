@@ -60,7 +60,7 @@ def make_gait(**changes: Any) -> GaitState:
         air_time=[0.0, 0.0],
         landed_air_time=[0.0, 0.0],
         swing_height=[0.0, 0.0],
-        mean_velocity=[0.0, 0.0],
+        mean_error=[0.0, 0.0],
         stance=[True, True],
         clock=[0.0, 1.0],
     )

@@ -92,7 +92,7 @@ def test_a_quarter_of_the_height_and_an_eighth_of_the_mass():
     c = similar.scaled(laptop, small)
     assert (c.curriculum.v_limit, c.gait.cycle_time, c.curriculum.cycle_min) == (2.25, 0.32, 0.19)
     assert c.command.vy == (-0.15, 0.15) and c.randomize.base_mass == (-0.625, 0.625)
-    assert c.rewards.momentum_scale == pytest.approx(2.0 / 64, rel=1e-2)  # three digits
+    assert c.rewards.momentum_scale == pytest.approx(3.0 / 64, rel=1e-2)  # three digits
     assert c.rewards.base_height_target == pytest.approx(0.2225, rel=1e-2)
     assert c.rewards.weights.torques == pytest.approx(-1e-5 * 32**2, rel=1e-2)
     assert c.rewards.weights.dof_acc == pytest.approx(-3e-7 / 16, rel=1e-2)
@@ -108,8 +108,9 @@ def test_sums_over_joints_scale_with_their_number(biped):
     assert biped.count == 9
     for term in ("action_smoothness", "dof_vel_limits"):
         assert factors[f"rewards.weights.{term}"] == 16 / 9
-    restless = factors["rewards.restless"] * factors["rewards.weights.stand_still"]
-    assert restless == pytest.approx(16 / 9)
+    weight = factors["rewards.weights.stand_still"]
+    assert weight * factors["rewards.restless"] == pytest.approx(16 / 9)
+    assert weight * factors["rewards.shuffle"] == pytest.approx(1 / biped.length_ratio)
     assert factors["rewards.joint_pos_kernel"] == pytest.approx(4 / 3)
     assert similar.scaled(c, biped).rewards.joint_pos_clip == pytest.approx(0.375)
     assert factors["rewards.knee_distance"] == pytest.approx(0.2 / XBOT.knees_apart)
@@ -150,8 +151,9 @@ def command(vx: float) -> Command:
 def test_widths_follow_from_the_number_of_joints(biped, setup):
     assert observations.actor_width(biped) == 11 + 3 * 9
     assert observations.critic_width(biped) == 25 + 4 * 9
+    assert observations.critic_width(biped, memory=True) == 61 + 6
     state = env.reset(setup, jax.random.key(0), curriculum.init(setup))
-    assert state.history.shape == (3, 38) and state.privileged_history.shape[-1] == 61
+    assert state.history.shape == (3, 38) and state.privileged_history.shape[-1] == 67
     assert state.last_action.shape == (9,) and state.dynamics.link_mass.shape == (10,)
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from states import ACTOR, XBOT
+from states import ACTOR, XBOT, make_gait
 
 from benchmarks import (
     compile_time,
@@ -151,9 +151,10 @@ def test_purejaxrls_loop_learns_the_same(debug):
 def test_gym_environment_is_the_same_robot(debug):
     """Physics, motors and frames of the Gymnasium environment equal those of the package."""
     pytest.importorskip("gymnasium", reason="an extra, needed by one benchmark only")
+    from benchmarks import comparison
     from benchmarks.gym_env import XBot
 
-    config = timing.on_engine(debug, "mujoco")
+    config = timing.on_engine(comparison.comparable(debug), "mujoco")
     env = XBot(config, seed=1)
     env._noise[:] = 0.0
     env.reset()
@@ -177,7 +178,7 @@ def test_gym_environment_is_the_same_robot(debug):
     env._read()
     sources = observations.Sources(
         signals=signals.read(env.robot, state),
-        gait=SimpleNamespace(clock=env.clock, stance=jnp.asarray(env.stance)),
+        gait=make_gait(clock=env.clock, stance=env.stance),
         command=SimpleNamespace(velocity=env.command),
         dynamics=SimpleNamespace(friction=jnp.ones(())),
         reference=env.reference,

@@ -180,7 +180,10 @@ def test_devices_tell_what_the_documentation_counts(glided):
     actor, critic = t + MJX.env.frames - 1, t + MJX.env.privileged_frames - 1
     floats = {
         "frames": n
-        * (actor * observations.actor_width(XBOT) + critic * observations.critic_width(XBOT)),
+        * (
+            actor * observations.actor_width(XBOT)
+            + critic * observations.critic_width(XBOT, MJX.env.critic_memory)
+        ),
         "action and mean": 2 * n * t * XBOT.count,
         "velocities": 3 * n * t,
         "distances of pairs, from which MJX takes the nearest: once per physics step": 42 * n,

@@ -63,7 +63,7 @@ def test_rows_of_the_biped(biped):
     assert facts["soles"].startswith("0.160 m x 0.060 m, 0.040 m below the ankle, 0.0 degrees")
     assert facts["feet, knees apart"] == "0.200 m, 0.200 m"
     assert facts["contacts in training"].startswith("13 pairs of 7 parts")
-    assert facts["observations"] == "actor 38, critic 61"  # 11 + 3 x 9, 25 + 4 x 9
+    assert facts["observations"] == "actor 38, critic 67"  # 11 + 3 x 9, 31 + 4 x 9
 
 
 def test_axis_names():
@@ -201,6 +201,12 @@ CASES = {
         (('axis="0 1 0" range="-0.1 2.2"', 'axis="0 1 0" range="-0.1 1.2"'),),
         "home, config: gait",
         "port_lock, star_lock: the reference motion leaves the range by",
+    ),
+    "too fast": (
+        '[config]\n"gait.cycle_time" = 0.2\n"curriculum.cycle_min" = 0.1\n',
+        (),
+        "config: gait",
+        "the reference motion asks for",
     ),
     "low feet": (
         '[config]\n"gait.reference_scale" = 0.05\n',

@@ -86,13 +86,17 @@ def test_double_support_turns_into_flight_with_the_square_of_the_speed(vx, phase
     assert state.stance.tolist() == [left, right]
 
 
-def test_mean_velocity_forgets_over_a_cycle():
-    """A first-order filter with dt / cycle = 0.01 / 0.5 a step. After one cycle at 1 m/s it is at
-    1 - 0.98^50 = 0.6358."""
-    state, signals = make_gait(), make_signals(base_linvel=[1.0, -2.0, 5.0])
+def test_the_mean_error_forgets_over_a_cycle():
+    """A first-order filter with dt / cycle = 0.01 / 0.5 a step. After one cycle with an error of
+    1 m/s it is at 1 - 0.98^50 = 0.6358. A new command that the robot follows at once adds none."""
+    state, signals = make_gait(), make_signals(base_linvel=[1.5, -2.0, 5.0])
     for _ in range(50):
-        state = update(PAPER, state, signals, make_command(), jnp.asarray(0.5))
-    np.testing.assert_allclose(state.mean_velocity, [0.63583, -1.27166], rtol=1e-4)
+        command = make_command(velocity=[0.5, 0.0, 0.0])
+        state = update(PAPER, state, signals, command, jnp.asarray(0.5))
+    np.testing.assert_allclose(state.mean_error, [0.63583, -1.27166], rtol=1e-4)
+    exact = make_command(velocity=[1.5, -2.0, 0.0])
+    after = update(PAPER, state, signals, exact, jnp.asarray(0.5))
+    np.testing.assert_allclose(after.mean_error, 0.98 * state.mean_error, rtol=1e-5)
 
 
 def test_clock_runs_once_around_in_a_cycle():

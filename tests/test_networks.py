@@ -50,11 +50,11 @@ def test_parity_splits_every_vector(mirror):
 
 def test_value_of_a_mirrored_robot_is_the_same():
     params = perturbed(CONFIG)
-    frames = jax.random.normal(
-        KEY, (5, CONFIG.env.privileged_frames, observations.critic_width(XBOT))
-    )
+    table = observations.critic_table(XBOT, CONFIG.env.critic_memory)
+    shape = 5, CONFIG.env.privileged_frames, observations.width(table)
+    frames = jax.random.normal(KEY, shape)
     here = networks.value(CONFIG, params, frames)
-    there = networks.value(CONFIG, params, mirrored(CRITIC, frames))
+    there = networks.value(CONFIG, params, mirrored(table, frames))
     np.testing.assert_allclose(here, there, rtol=1e-4, atol=1e-5)
     assert np.std(here) > 0.1
 

@@ -261,11 +261,11 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
     ("low_speed", KSLC, {"vx": -0.3, "base_linvel": [-0.1, 0, 0]}, -1.0),
     ("low_speed", KSLC, {"vx": 0.05, "base_linvel": [-1.0, 0, 0]}, 0.0),
     ("low_speed", KSLC, {"velocity": [0.0, 0.3, 0.0], "base_linvel": [1.0, 0, 0]}, 0.0),
-    # The mean velocity counts, not the present one. The error is |(0.06, -0.08)| = 0.1: e^-1.
+    # The mean error counts, not the present one. It is |(0.06, -0.08)| = 0.1: e^-1.
     (
         "tracking_mean_vel",
         KSLC,
-        {"velocity": [1.0, 0, 0.5], "mean_velocity": [1.06, -0.08], "base_linvel": [9, 9, 9]},
+        {"velocity": [1.0, 0, 0.5], "mean_error": [0.06, -0.08], "base_linvel": [9, 9, 9]},
         0.36787944,
     ),
     # v_max half way from 0.5 to 2.5 m/s: 0.5. At the start of the curriculum: 0.
@@ -398,6 +398,21 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
             value,
         )
         for restless, v_max, value in ((0.0, 3.5, 0.7), (0.5, 3.5, 1.2), (0.5, 1.5, 0.95))
+    ),
+    # `shuffle` adds 2 * (0.3^2 + 0.4^2 + 0.1^2) to 0.1 * 2, and half of that at v_max 1.5.
+    *(
+        (
+            "stand_still",
+            dataclasses.replace(KSLC, shuffle=2.0),
+            {
+                "moving": False,
+                "v_max": v_max,
+                "joint_vel": joints(left_knee=2.0),
+                "foot_vel": [[0.3, 0.0, 0.4], [0.0, -0.1, 0.0]],
+            },
+            value,
+        )
+        for v_max, value in ((3.5, 0.72), (1.5, 0.46))
     ),
     (
         "stand_still",

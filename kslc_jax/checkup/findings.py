@@ -221,6 +221,13 @@ def reference(x: Patient) -> Iterator[Finding]:
                 "home, config: gait",
                 f"{names}: the reference motion leaves the range by {value:.2f} rad",
             )
+    for names, value in x.both(statics.reference_speed(x.config, x.train) / x.train.speed_limit):
+        if value > 1:
+            yield Finding(
+                "config: gait",
+                f"{names}: the reference motion asks for {value:.2f} times its largest speed: make "
+                "the gait's swing or sweep smaller, or its cycle longer",
+            )
     lift, target = statics.foot_lift(x.config, x.train), x.config.rewards.clearance_target
     if lift < target / 2:
         yield Finding(

@@ -181,7 +181,7 @@ def fact_rows(x: Patient) -> list[tuple[str, str]]:
     model, size = it.mj_model, "{:.3f} m, {:.2f} of XBot-L's"
     sole = statics.sole_size(it, "left")
     count, parts = model.npair, len(set(model.pair_geom1) | set(model.pair_geom2))
-    widths = observations.actor_width(it), observations.critic_width(it)
+    widths = observations.actor_width(it), observations.critic_width(it, config.env.critic_memory)
     base, trunk = model.body(it.anatomy.base).name, it.trunk_body_id
     return [
         ("mass", f"{it.total_mass:.1f} kg, {it.mass_ratio:.2f} of XBot-L's"),

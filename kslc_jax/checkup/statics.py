@@ -1,6 +1,7 @@
 """Numbers of a robot without a simulation: standing torques, contacts, the reference motion."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -140,16 +141,23 @@ def unfelt(train: Robot, high: Robot) -> tuple[int, int]:
 def reference(config: Config, robot: Robot, speed: float, phases: np.ndarray) -> np.ndarray:
     """Reference angles [..., n, rad] from home at a commanded speed [m/s] and phases [...] in
     [0, 1)."""
-    command = commands.standing(jnp.zeros(())).replace(
-        velocity=jnp.array([speed, 0.0, 0.0]), moving=jnp.ones((), bool)
-    )
+    pose = functools.partial(_pose, config, robot, speed)
+    return np.asarray(jnp.vectorize(pose, signature="()->(n)")(jnp.asarray(phases)))
+
+
+def _walking(speed: float) -> commands.Command:
+    """The command to walk ahead with `speed` [m/s]."""
+    ahead, moving = jnp.array([speed, 0.0, 0.0]), jnp.ones((), bool)
+    return commands.standing(jnp.zeros(())).replace(velocity=ahead, moving=moving)
+
+
+def _pose(config: Config, robot: Robot, speed: float, phase: jax.Array) -> jax.Array:
+    """Reference angles [n, rad] from home at a commanded speed [m/s] and a phase [] in [0, 1)."""
+    command = _walking(speed)
     start = gait.init(config.gait, jax.random.key(0), command, jnp.zeros(2))
-
-    def one(angle: jax.Array) -> jax.Array:
-        state = start.replace(clock=jnp.stack([jnp.sin(angle), jnp.cos(angle)]))
-        return gait.reference_pose(config.gait, robot, state, command)
-
-    return np.asarray(jnp.vectorize(one, signature="()->(n)")(2 * np.pi * jnp.asarray(phases)))
+    clock, stance = gait.clock_of(config.gait, phase, command)
+    now = start.replace(clock=clock, stance=stance)
+    return gait.reference_pose(config.gait, robot, now, command)
 
 
 def out_of_range(config: Config, robot: Robot) -> np.ndarray:
@@ -163,6 +171,23 @@ def out_of_range(config: Config, robot: Robot) -> np.ndarray:
         for speed in (0.0, config.gait.full_speed)
     ]
     return np.max(beyond, axis=(0, 1))
+
+
+def reference_speed(config: Config, robot: Robot) -> np.ndarray:
+    """[n] largest speed [rad/s] that the reference motion asks of each joint, under commands from
+    rest to the last v_max.
+
+    HG's swing jumps where double support ends; these jumps do not count.
+    """
+    limits = config.curriculum
+    phases = jnp.arange(PHASES) / PHASES
+    fastest = []
+    for speed in np.arange(limits.v_start, limits.v_limit + limits.v_step / 2, limits.v_step):
+        pose = functools.partial(_pose, config, robot, float(speed))
+        cycle = gait.cycle_time(config, _walking(float(speed)), limits.cycle_min, limits.v_limit)
+        per_cycle = jax.vmap(jax.jacfwd(pose))(phases)
+        fastest.append(np.abs(per_cycle).max(axis=0) / float(cycle))
+    return np.max(fastest, axis=0)
 
 
 def foot_lift(config: Config, robot: Robot) -> float:

@@ -51,6 +51,7 @@ _LAPTOP_LEARNER: dict[str, Any] = {
 
 _LAPTOP = _override(
     _override(_PAPER, **_LAPTOP_LEARNER),
+    env={"critic_memory": True},
     network={"estimator": (128, 64)},
     ppo={"entropy_fades": True, "average": 0.98},
     command={
@@ -68,7 +69,7 @@ _LAPTOP = _override(
         "double_support_at_speed": -0.4,
         "reference_speed_gain": 1.0,
         "stride_sweep": 0.35,
-        "arm_swing": 0.5,
+        "arm_swing": 0.38,
         "arm_swing_slow": 0.2,
         "elbow_bend": 1.0,
         "cycle_from_speed": 0.5,
@@ -101,7 +102,7 @@ _LAPTOP = _override(
         "noise": (0.0, 1.0),
     },
     rewards={
-        "momentum_scale": 2.0,
+        "momentum_scale": 3.0,
         "base_height_kernel": 30.0,
         "base_height_drop": 0.0,
         "clearance_width": 0.03,
@@ -112,6 +113,7 @@ _LAPTOP = _override(
         "lean_per_speed": 0.03,
         "exact_full": 2.0,
         "restless": 0.3,
+        "shuffle": 20.0,
         "weights": {
             "feet_contact_number": 2.0,
             "feet_clearance": 0.7,

@@ -94,11 +94,13 @@ class RewardConfig:
     lean_per_speed: float = 0.0
     """Forward lean per commanded speed [rad per m/s] at which `orientation` is best."""
     exact_from: float = 0.5
-    """`tracking_mean_vel` and `restless` are 0 while v_max [m/s] <= exact_from."""
+    """`tracking_mean_vel`, `restless` and `shuffle` are 0 while v_max [m/s] <= exact_from."""
     exact_full: float = 2.5
-    """`tracking_mean_vel` and `restless` have full size while v_max [m/s] >= exact_full."""
+    """They have full size while v_max [m/s] >= exact_full."""
     restless: float = 0.0
     """Weight of squared action changes within the term `stand_still`, at full size."""
+    shuffle: float = 0.0
+    """Weight of the squared speeds of the feet [m^2/s^2] within `stand_still`, at full size."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which `dof_vel_limits` counts."""
 
