@@ -30,6 +30,7 @@ from kslc_jax import (
     evaluate,
     export,
     files,
+    judge,
     learning,
     play,
     plots,
@@ -250,32 +251,43 @@ COMMANDS = [(evaluate.main, ()), (sim2sim.main, ()), (play.main, PICTURE)]
 NAMES = ["evaluate", "sim2sim", "play"]
 
 
-@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=NAMES)
-class TestPolicyCommands:
-    @pytest.fixture(autouse=True)
-    def any_renderer(self, monkeypatch):
-        """Sets a renderer. No test here draws, so the machine need not have it."""
-        monkeypatch.setenv("MUJOCO_GL", "egl")
+@pytest.fixture
+def any_renderer(monkeypatch):
+    """Sets a renderer. Tests of bad input draw nothing, so the machine need not have it."""
+    monkeypatch.setenv("MUJOCO_GL", "egl")
 
+
+@pytest.mark.usefixtures("any_renderer")
+@pytest.mark.parametrize(("main", "more"), COMMANDS, ids=NAMES)
+class TestTrialOptions:
     @few
     @given(word=words)
     def test_words_for_numbers(self, main, more, policy, word):
-        for name in ("speeds", "seconds", "seed"):
+        for name in ("speeds", "seconds"):
             assert f"--{name}" in refused(main, policy, *more, f"--{name}", word)
 
     @pytest.mark.parametrize("value", [0, -1, "nan", "inf"])
     def test_seconds(self, main, more, policy, value):
         assert "seconds" in refused(main, policy, *more, f"--seconds={value}")
 
-    @pytest.mark.parametrize("value", [-1, 2**31, 10**20])
-    def test_seed(self, main, more, policy, value):
-        assert "seed" in refused(main, policy, *more, f"--seed={value}")
-
     def test_no_speeds(self, main, more, policy):
         assert "speeds" in refused(main, policy, *more, "--speeds")
 
     def test_speed_is_no_number(self, main, more, policy):
         assert "speeds" in refused(main, policy, *more, "--speeds", "1.0", "nan")
+
+
+@pytest.mark.usefixtures("any_renderer")
+@pytest.mark.parametrize(("main", "more"), [*COMMANDS, (judge.main, ())], ids=[*NAMES, "judge"])
+class TestPolicyAndSeed:
+    @few
+    @given(word=words)
+    def test_words_for_a_seed(self, main, more, policy, word):
+        assert "--seed" in refused(main, policy, *more, "--seed", word)
+
+    @pytest.mark.parametrize("value", [-1, 2**31, 10**20])
+    def test_seed(self, main, more, policy, value):
+        assert "seed" in refused(main, policy, *more, f"--seed={value}")
 
     def test_nothing_there(self, main, more, tmp_path):
         missing = tmp_path / "nicht da 空"
