@@ -127,8 +127,7 @@ def update(config: CurriculumConfig, state: Curriculum, progress: Progress) -> C
     """Adds `progress` to the averages. If the gate opens, widens the range and shortens the cycle.
 
     The gate opens if all `conditions` are met. At least `min_updates` updates lie between two
-    changes. After a change the averages of fast commands and the sums at the top start at zero
-    again.
+    changes. After a change the averages of fast commands and the sums at the top start anew.
     """
     state = _averaged(config, state, progress)
     v_max = jnp.minimum(state.v_max + config.v_step, config.v_limit)
@@ -162,12 +161,17 @@ def _averaged(config: CurriculumConfig, state: Curriculum, progress: Progress) -
         mixed = config.smoothing * old + (1.0 - config.smoothing) * new
         return jnp.where(count > 0, mixed, old)
 
-    fast_count = progress.fast_count
+    def restarted(old: jax.Array, new: jax.Array) -> jax.Array:
+        # A plain mean at first: an average that starts at 0 would stay below the true value for
+        # some fifty updates, and keep the gate shut.
+        gain = jnp.maximum(1.0 - config.smoothing, 1.0 / (state.updates + 1))
+        return jnp.where(progress.fast_count > 0, old + gain * (new - old), old)
+
     return state.replace(
         tracking=average(state.tracking, progress.tracking, progress.tracking_count),
-        fast_tracking=average(state.fast_tracking, progress.fast_tracking, fast_count),
+        fast_tracking=restarted(state.fast_tracking, progress.fast_tracking),
         episode_steps=average(state.episode_steps, progress.episode_steps, progress.episode_count),
-        gait=average(state.gait, progress.gait, fast_count),
+        gait=restarted(state.gait, progress.gait),
         top_deviation=config.smoothing * state.top_deviation + progress.top_deviation,
         top_scale=config.smoothing * state.top_scale + progress.top_scale,
         top_falls=config.smoothing * state.top_falls + progress.top_falls,

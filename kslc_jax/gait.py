@@ -30,7 +30,7 @@ class GaitState:
     air_time: jax.Array  # [2] s in the air, 0 if grounded (see `update`)
     landed_air_time: jax.Array  # [2] s, air time that ended at this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
-    mean_error: jax.Array  # [2] m/s, vx, vy less the command, mean over about one cycle
+    mean_error: jax.Array  # [2] m/s, vx, vy less the command, mean over about one cycle, see update
     stance: jax.Array  # [2] bool, True: the clock wants this foot on the ground
     clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
 
@@ -68,7 +68,9 @@ def update(
     """Advances the clock by `dt` [s] and updates contacts, air times and heights.
 
     A foot is grounded if it has contact, had contact at the step before, or should have it by the
-    clock (HG). When a foot becomes grounded, `landed_air_time` is its air time.
+    clock (HG). When a foot becomes grounded, `landed_air_time` is its air time. While the command
+    approaches the wanted one, its error does not count in `mean_error`: no robot follows such a
+    ramp exactly, and a robot that makes up for it later would overshoot.
     """
     phase = jnp.mod(state.phase + dt / cycle_time, 1.0)
     clock, stance = clock_of(config, phase, command)
@@ -76,7 +78,8 @@ def update(
     grounded = contact | stance | state.contact
     flown = state.air_time > 0.0
     air_time = state.air_time + dt
-    error = signals.base_linvel[:2] - command.velocity[:2]
+    arrived = jnp.all(command.velocity[:2] == command.wanted)
+    error = arrived * (signals.base_linvel[:2] - command.velocity[:2])
     foot_z = signals.foot_pos[:, 2]
     return GaitState(
         phase=phase,

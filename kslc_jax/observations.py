@@ -68,7 +68,7 @@ def actor_table(robot: Robot) -> Table:
 def critic_table(robot: Robot, memory: bool = False) -> Table:
     """Components of the critic's frame: 25 + 4 n values for n joints, 89 for XBot-L.
 
-    On uneven ground that the critic sees there are four more. `memory` adds six, see
+    On uneven ground that the critic sees there are four more. `memory` adds eight, see
     `EnvConfig.critic_memory`.
     """
     n = robot.count
@@ -78,6 +78,7 @@ def critic_table(robot: Robot, memory: bool = False) -> Table:
         Component("slope", 2, 5.0, 0.0, "polar"),
     )
     remembered = (
+        Component("wanted", 2, 2.0, 0.0, "polar"),
         Component("mean_error", 2, 2.0, 0.0, "polar"),
         Component("air_time", 2, 2.0, 0.0, "swap"),
         Component("swing_height", 2, 10.0, 0.0, "swap"),
@@ -163,6 +164,7 @@ def _values(src: Sources) -> dict[str, jax.Array]:
         "base_mass": src.base_mass[None],
         "stance": src.gait.stance.astype(jnp.float32),
         "contact": s.foot_contact.astype(jnp.float32),
+        "wanted": src.command.wanted,
         "mean_error": src.gait.mean_error,
         "air_time": src.gait.air_time,
         "swing_height": src.gait.swing_height,

@@ -151,9 +151,9 @@ def command(vx: float) -> Command:
 def test_widths_follow_from_the_number_of_joints(biped, setup):
     assert observations.actor_width(biped) == 11 + 3 * 9
     assert observations.critic_width(biped) == 25 + 4 * 9
-    assert observations.critic_width(biped, memory=True) == 61 + 6
+    assert observations.critic_width(biped, memory=True) == 61 + 8
     state = env.reset(setup, jax.random.key(0), curriculum.init(setup))
-    assert state.history.shape == (3, 38) and state.privileged_history.shape[-1] == 67
+    assert state.history.shape == (3, 38) and state.privileged_history.shape[-1] == 69
     assert state.last_action.shape == (9,) and state.dynamics.link_mass.shape == (10,)
 
 

@@ -69,17 +69,20 @@ def test_another_trainings_progress_ends_at_the_limits_of_this_one():
 
 
 def test_averages_by_hand():
-    """0.95 old + 0.05 new: 0.05 * 0.8 = 0.04; 0.95 * 0.04 + 0.05 * 0.6 = 0.068."""
+    """0.95 old + 0.05 new: 0.05 * 0.8 = 0.04; 0.95 * 0.04 + 0.05 * 0.6 = 0.068. That of the fast
+    commands, which starts anew with every range, is a plain mean until it has 20 updates."""
     one = curriculum.update(CONFIG, state(), progress(0.8, 0.4, 3, 200.0, 2))
     assert float(one.tracking) == pytest.approx(0.04)
-    assert float(one.fast_tracking) == pytest.approx(0.02)
+    assert float(one.fast_tracking) == pytest.approx(0.4)
     assert float(one.episode_steps) == pytest.approx(10.0)
     assert int(one.updates) == 1
     two = curriculum.update(CONFIG, one, progress(0.6, 0.6, 3, 400.0, 1))
     assert float(two.tracking) == pytest.approx(0.068)
-    assert float(two.fast_tracking) == pytest.approx(0.049)  # 0.019 + 0.03
+    assert float(two.fast_tracking) == pytest.approx(0.5)  # the mean of 0.4 and 0.6
     assert float(two.episode_steps) == pytest.approx(29.5)  # 9.5 + 20
     assert int(two.updates) == 2
+    late = curriculum.update(CONFIG, state(updates=30, gait=0.6), progress(gait=0.8))
+    assert float(late.gait) == pytest.approx(0.61)  # 0.57 + 0.04
 
 
 def test_a_shuffle_does_not_open_the_gate():

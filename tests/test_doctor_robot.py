@@ -63,7 +63,7 @@ def test_rows_of_the_biped(biped):
     assert facts["soles"].startswith("0.160 m x 0.060 m, 0.040 m below the ankle, 0.0 degrees")
     assert facts["feet, knees apart"] == "0.200 m, 0.200 m"
     assert facts["contacts in training"].startswith("13 pairs of 7 parts")
-    assert facts["observations"] == "actor 38, critic 67"  # 11 + 3 x 9, 31 + 4 x 9
+    assert facts["observations"] == "actor 38, critic 69"  # 11 + 3 x 9, 33 + 4 x 9
 
 
 def test_axis_names():

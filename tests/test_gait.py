@@ -95,8 +95,10 @@ def test_the_mean_error_forgets_over_a_cycle():
         state = update(PAPER, state, signals, command, jnp.asarray(0.5))
     np.testing.assert_allclose(state.mean_error, [0.63583, -1.27166], rtol=1e-4)
     exact = make_command(velocity=[1.5, -2.0, 0.0])
-    after = update(PAPER, state, signals, exact, jnp.asarray(0.5))
-    np.testing.assert_allclose(after.mean_error, 0.98 * state.mean_error, rtol=1e-5)
+    ramp = exact.replace(velocity=jnp.zeros(3))
+    for command in (exact, ramp):  # on a ramp no error counts
+        after = update(PAPER, state, signals, command, jnp.asarray(0.5))
+        np.testing.assert_allclose(after.mean_error, 0.98 * state.mean_error, rtol=1e-5)
 
 
 def test_clock_runs_once_around_in_a_cycle():

@@ -109,22 +109,28 @@ def test_slices():
     }
 
 
-# Mean velocity error x 2, air time x 2 and swing height x 10.
-REMEMBERED = {"mean_error": (1.4, -0.2), "air_time": (0.0, 0.3), "swing_height": (0.0, 0.6)}
+# Wanted velocity x 2, mean velocity error x 2, air time x 2 and swing height x 10.
+REMEMBERED = {
+    "wanted": (5.0, -0.6),
+    "mean_error": (1.4, -0.2),
+    "air_time": (0.0, 0.3),
+    "swing_height": (0.0, 0.6),
+}
 
 
 def test_the_critic_may_see_what_rewards_remember():
     """By hand. All that `gait.update` carries from step to step is then in the frame."""
     memory = dict(mean_error=[0.7, -0.1], air_time=[0.0, 0.15], swing_height=[0.0, 0.06])
-    src = make_sources(gait=make_gait(**memory))
+    command = make_command(velocity=[2.0, -0.3, 0.7], wanted=[2.5, -0.3])
+    src = make_sources(gait=make_gait(**memory), command=command)
     config = EnvConfig(critic_memory=True)
     frame = observations.critic_frame(config, XBOT, src)
-    assert observations.critic_width(XBOT, True) == 95 and frame.shape == (95,)
+    assert observations.critic_width(XBOT, True) == 97 and frame.shape == (97,)
     np.testing.assert_array_equal(frame[:89], observations.critic_frame(EnvConfig(), XBOT, src))
     np.testing.assert_allclose(frame[89:], np.concatenate(list(REMEMBERED.values())), atol=1e-6)
     permutation, sign = observations.mirror_map(observations.critic_table(XBOT, True), XBOT)
     np.testing.assert_allclose(
-        (frame[permutation] * sign)[89:], [1.4, 0.2, 0.3, 0.0, 0.6, 0.0], atol=1e-6
+        (frame[permutation] * sign)[89:], [5.0, 0.6, 1.4, 0.2, 0.3, 0.0, 0.6, 0.0], atol=1e-6
     )
 
 

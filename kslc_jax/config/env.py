@@ -34,9 +34,9 @@ class EnvConfig:
     privileged_frames: int = 3
     """Frames of critic history (paper, Table I)."""
     critic_memory: bool = False
-    """True: the critic's frame also has what reward terms remember of earlier steps: the mean
-    velocity error, and the air time and swing height of each foot. Without them it cannot tell how
-    much of these rewards is still to come."""
+    """True: the critic's frame also has what decides about the next steps and is not in the paper's
+    frame: the wanted vx and vy that the command approaches, and what reward terms remember, which
+    is the mean velocity error, and the air time and swing height of each foot."""
     arms: Literal["free", "held"] = "free"
     """free: the policy moves the arms. held: arm actions are ignored and servos keep the arms in
     the home pose (ablation, baseline). The gait's reference must then not move the arms."""
