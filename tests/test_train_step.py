@@ -30,16 +30,17 @@ def assert_same(a, b):
 
 
 def test_same_seed_same_bits_and_one_trace(made):
-    """Two runs of three train steps from one seed are bit-identical. The step is traced once."""
+    """Two runs of three train steps from one seed are bit-identical. Only the first step is
+    traced."""
     config, init, step = made
     finals = []
     for _ in range(2):
-        state = init()
-        for _ in range(3):
-            state, metrics = step(state)
+        state, metrics = step(init())
+        with jax.no_tracing():
+            for _ in range(2):
+                state, metrics = step(state)
         finals.append((state, metrics))
     assert_same(finals[0], finals[1])
-    assert step._cache_size() == 1
     other = train_step.make(dataclasses.replace(config, seed=1))[0]()
     kernels = [x.learner.params["actor"]["Dense_0"]["kernel"] for x in (other, init())]
     assert not np.array_equal(*kernels)
