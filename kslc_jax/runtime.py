@@ -220,12 +220,15 @@ def _excepthook(
 ) -> None:
     if issubclass(kind, KeyboardInterrupt):
         print("interrupted", file=sys.stderr)  # then Python ends as the signal ends a process
-    elif str(error) != "Event loop is closed":
+    else:
         sys.__excepthook__(kind, error, trace)
 
 
 def _unraisablehook(args: "sys.UnraisableHookArgs") -> None:
-    if not inspect.iscoroutine(args.object):
+    # After a failed save, orbax leaves coroutines behind, and threads of tensorstore still call the
+    # event loop, which it has closed.
+    late = str(args.exc_value) == "Event loop is closed"
+    if not (late or inspect.iscoroutine(args.object)):
         sys.__unraisablehook__(args)
 
 

@@ -81,6 +81,51 @@ def test_preparing_leaves_hooks_and_logs_alone(process):
     assert hooks() == before
 
 
+LATE_WRITES = """
+import asyncio, sys, time
+import numpy as np
+from kslc_jax import runtime
+{quiet}
+import tensorstore
+
+async def fails(path):
+    spec = {{"driver": "zarr", "kvstore": {{"driver": "file", "path": path}}}}
+    store = await tensorstore.open(spec, create=True, dtype=tensorstore.float32, shape=[2000, 2000])
+
+    async def write():
+        await store.write(np.random.rand(2000, 2000).astype(np.float32))
+
+    tasks = [asyncio.create_task(write()) for _ in range(8)]
+    await asyncio.sleep(0)
+    return tasks
+
+loop = asyncio.new_event_loop()
+tasks = loop.run_until_complete(fails(sys.argv[1]))
+loop.close()
+time.sleep(2)
+"""
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_writes_that_end_after_a_failed_save_are_silent(quiet, tmp_path):
+    """Orbax closes its event loop when a save fails; threads of tensorstore still call it."""
+    code = LATE_WRITES.format(quiet="runtime.quiet()" if quiet else "")
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    assert ("Event loop is closed" in done.stderr) != quiet
+
+
+def test_other_errors_that_nobody_can_catch_are_shown(process, capsys):
+    class Bad:
+        def __del__(self):
+            raise ValueError("so")
+
+    cli.run(lambda: None)
+    Bad()
+    assert "ValueError: so" in capsys.readouterr().err
+
+
 def test_a_command_silences_its_process(process):
     cli.run(lambda: None)
     assert sys.excepthook is not sys.__excepthook__
