@@ -54,11 +54,7 @@ class Adapter(brax.envs.Env):
     @property
     def observation_size(self) -> Any:
         frames = self.config.env.frames, self.config.env.privileged_frames
-        memory = self.config.env.critic_memory
-        widths = (
-            observations.actor_width(self.robot),
-            observations.critic_width(self.robot, memory),
-        )
+        widths = _widths(self.config)
         return {"state": frames[0] * widths[0], "privileged_state": frames[1] * widths[1]}
 
     @property
@@ -80,11 +76,16 @@ def _wrap(adapter: Adapter, **_: Any) -> brax.envs.Env:
     return brax.envs.training.VmapWrapper(adapter)
 
 
-def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]:
-    """Our actor and critic with Brax's interface."""
+def _widths(config: Config) -> tuple[int, int]:
+    """Widths of an actor frame and of a critic frame."""
     robot = physics.robot_for(config.physics)
     memory = config.env.critic_memory
-    widths = observations.actor_width(robot), observations.critic_width(robot, memory)
+    return observations.actor_width(robot), observations.critic_width(robot, memory)
+
+
+def _network_factory(config: Config) -> Callable[..., brax_networks.PPONetworks]:
+    """Our actor and critic with Brax's interface."""
+    robot, widths = physics.robot_for(config.physics), _widths(config)
 
     def stacked(obs: jax.Array, width: int) -> jax.Array:
         return obs.reshape(*obs.shape[:-1], -1, width)

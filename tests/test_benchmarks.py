@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from states import ACTOR, XBOT, make_gait
+from states import ACTOR, XBOT, make_command, make_gait
 
 from benchmarks import (
     compile_time,
@@ -101,7 +101,9 @@ def test_ratios_are_of_each_turn():
     assert rows["kslc_jax"]["times_slower"] == 1.0
 
 
-@pytest.mark.parametrize("estimator", [(16,), pytest.param((), marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "estimator", [(16,), pytest.param((), marks=pytest.mark.slow(reason="traces both again"))]
+)
 def test_purejaxrls_loop_is_of_todays_train_step(debug, estimator):
     """Its states and metrics have the shapes and names of ours."""
     network = dataclasses.replace(debug.network, estimator=estimator)
@@ -179,7 +181,7 @@ def test_gym_environment_is_the_same_robot(debug):
     sources = observations.Sources(
         signals=signals.read(env.robot, state),
         gait=make_gait(clock=env.clock, stance=env.stance),
-        command=SimpleNamespace(velocity=env.command),
+        command=make_command(velocity=env.command),
         dynamics=SimpleNamespace(friction=jnp.ones(())),
         reference=env.reference,
         last_action=env.action,

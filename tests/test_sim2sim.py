@@ -150,7 +150,9 @@ def test_a_payload_takes_no_more_than_the_trunk_weighs(capsys):
     assert "payload" not in said.out
 
 
-@pytest.mark.parametrize("steps", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.parametrize(
+    "steps", [pytest.param(1, marks=pytest.mark.slow(reason="compiles, like two steps")), 2]
+)
 def test_latency_sends_an_action_of_some_steps_before(random_policy, frozen, steps):
     """In the first steps there is none, which asks for the default pose."""
     sent, history = actions(random_policy, latency=steps)
