@@ -87,8 +87,8 @@ def load_policy(path_or_name: str | Path) -> Policy:
             reached = meta["metrics"]
             step = int(reached.get("step", folder.name if folder.name.isdigit() else 0))
             curriculum = curriculum_lib.init(config).replace(
-                v_max=jnp.asarray(reached["curriculum/v_max"]),
-                cycle_time=jnp.asarray(reached["curriculum/cycle_time"]),
+                v_max=jnp.asarray(reached["curriculum/v_max"], jnp.float32),
+                cycle_time=jnp.asarray(reached["curriculum/cycle_time"], jnp.float32),
             )
             like = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
             args = ocp.args.Composite(params=ocp.args.StandardRestore(abstract(like)))
