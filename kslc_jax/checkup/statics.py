@@ -145,13 +145,13 @@ def reference(config: Config, robot: Robot, speed: float, phases: np.ndarray) ->
     return np.asarray(jnp.vectorize(pose, signature="()->(n)")(jnp.asarray(phases)))
 
 
-def _walking(speed: float) -> commands.Command:
+def _walking(speed: float | jax.Array) -> commands.Command:
     """The command to walk ahead with `speed` [m/s]."""
     ahead, moving = jnp.array([speed, 0.0, 0.0]), jnp.ones((), bool)
     return commands.standing(jnp.zeros(())).replace(velocity=ahead, moving=moving)
 
 
-def _pose(config: Config, robot: Robot, speed: float, phase: jax.Array) -> jax.Array:
+def _pose(config: Config, robot: Robot, speed: float | jax.Array, phase: jax.Array) -> jax.Array:
     """Reference angles [n, rad] from home at a commanded speed [m/s] and a phase [] in [0, 1)."""
     command = _walking(speed)
     start = gait.init(config.gait, jax.random.key(0), command, jnp.zeros(2))
@@ -181,13 +181,14 @@ def reference_speed(config: Config, robot: Robot) -> np.ndarray:
     """
     limits = config.curriculum
     phases = jnp.arange(PHASES) / PHASES
-    fastest = []
-    for speed in np.arange(limits.v_start, limits.v_limit + limits.v_step / 2, limits.v_step):
-        pose = functools.partial(_pose, config, robot, float(speed))
-        cycle = gait.cycle_time(config, _walking(float(speed)), limits.cycle_min, limits.v_limit)
-        per_cycle = jax.vmap(jax.jacfwd(pose))(phases)
-        fastest.append(np.abs(per_cycle).max(axis=0) / float(cycle))
-    return np.max(fastest, axis=0)
+    speeds = np.arange(limits.v_start, limits.v_limit + limits.v_step / 2, limits.v_step)
+
+    def fastest(speed: jax.Array) -> jax.Array:
+        pose = functools.partial(_pose, config, robot, speed)
+        cycle = gait.cycle_time(config, _walking(speed), limits.cycle_min, limits.v_limit)
+        return jnp.abs(jax.vmap(jax.jacfwd(pose))(phases)).max(axis=0) / cycle
+
+    return np.asarray(jax.jit(jax.vmap(fastest))(jnp.asarray(speeds)).max(axis=0))
 
 
 def foot_lift(config: Config, robot: Robot) -> float:
