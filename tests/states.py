@@ -3,12 +3,15 @@
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from kslc_jax import observations, robot
+from kslc_jax import curriculum, networks, observations, robot
 from kslc_jax.commands import Command
+from kslc_jax.config import Config
 from kslc_jax.gait import GaitState
+from kslc_jax.policy import Policy
 from kslc_jax.signals import Signals
 
 XBOT = robot.load()
@@ -73,6 +76,25 @@ def make_command(**changes: Any) -> Command:
     if "velocity" in changes:  # the wanted one, unless the test names another
         start["wanted"] = np.asarray(changes["velocity"])[:2]
     return _fill(Command, start, changes)
+
+
+def random_params(config: Config, scale: float = 1.0) -> networks.Params:
+    """Random parameters, also biases. `networks.init` would compile dozens of small programs."""
+    shapes = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
+    rng = np.random.default_rng(0)
+
+    def draw(x: jax.ShapeDtypeStruct) -> np.ndarray:
+        fan_in = x.shape[0] if len(x.shape) == 2 else 4.0
+        return (scale * rng.normal(size=x.shape) / np.sqrt(fan_in)).astype(x.dtype)
+
+    return jax.tree.map(draw, shapes)
+
+
+def still_policy(config: Config, step: int = 0) -> Policy:
+    """A policy that asks for the default pose whatever it sees."""
+    shapes = jax.eval_shape(lambda: networks.init(config, jax.random.key(0)))
+    params = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
+    return Policy(config, params, curriculum.init(config), step)
 
 
 def joints(**values: float) -> np.ndarray:

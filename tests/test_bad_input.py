@@ -45,7 +45,7 @@ from kslc_jax.config import PRESETS, ConfigError, preset, to_dict
 from kslc_jax.training import checkpoint
 
 few = settings(
-    max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 words = st.text(string.ascii_letters, min_size=4, max_size=8).filter(
     lambda w: w.lower() != "infinity"
@@ -105,7 +105,7 @@ class TestTrain:
     def test_no_positive_count(self, run_dir, name, value):
         assert name.replace("-", "_") in self.refused(run_dir, f"--{name}", value)
 
-    @few
+    @settings(few, max_examples=3)  # each traces a training
     @given(st.sampled_from([*SIZES, "network.actor"]), st.integers(2**34, 2**70))
     def test_sizes_beyond_any_memory(self, run_dir, name, value):
         said = self.refused(run_dir, f"--{name}", 2 * value)

@@ -101,9 +101,8 @@ def test_ratios_are_of_each_turn():
     assert rows["kslc_jax"]["times_slower"] == 1.0
 
 
-@pytest.mark.parametrize(
-    "estimator", [(16,), pytest.param((), marks=pytest.mark.slow(reason="traces both again"))]
-)
+@pytest.mark.slow(reason="traces two train steps")
+@pytest.mark.parametrize("estimator", [(16,), ()])
 def test_purejaxrls_loop_is_of_todays_train_step(debug, estimator):
     """Its states and metrics have the shapes and names of ours."""
     network = dataclasses.replace(debug.network, estimator=estimator)

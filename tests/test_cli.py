@@ -10,6 +10,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+import slow
 
 from kslc_jax import cli, compare, doctor, physics, robot, runtime, train
 from kslc_jax.config import ConfigError
@@ -106,7 +107,7 @@ time.sleep(2)
 """
 
 
-@pytest.mark.parametrize("quiet", [True, False])
+@pytest.mark.parametrize("quiet", [True, *slow.cases("a process of its own", False)])
 def test_writes_that_end_after_a_failed_save_are_silent(quiet, tmp_path):
     """Orbax closes its event loop when a save fails; threads of tensorstore still call it."""
     code = LATE_WRITES.format(quiet="runtime.quiet()" if quiet else "")

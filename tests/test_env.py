@@ -1,6 +1,7 @@
 """One environment: resets, the ends of episodes, actions, pushes, commands and observations."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -213,18 +214,13 @@ def test_a_robot_brakes_for_four_seconds_after_its_last_command_at_the_top(setti
         assert bool(outcome.braking) == (braking and after > 0), time
 
 
-def test_jit_equals_no_jit_and_batch_of_one():
+def test_jit_equals_no_jit_and_batch_of_one(setting):
     """The tolerance is 1e-4, because fused float32 programs add in another order."""
-    config = preset("debug")
-    cur = curriculum.init(config)
-    state = jax.jit(lambda key: env.reset(config, key, cur))(jax.random.key(0))
-    args = state, 0.1 * jnp.ones(16), jax.random.key(1)
-    plain = env.step(config, *args, cur)
-    jitted = jax.jit(lambda s, a, k: env.step(config, s, a, k, cur))(*args)
-    one = jax.vmap(lambda s, a, k: env.step(config, s, a, k, cur))(
-        *jax.tree.map(lambda x: x[None], args)
-    )
-    for a, b, c in zip(*map(jax.tree.leaves, (plain, jitted, one)), strict=True):
+    config, reset, step = setting
+    args = reset(jax.random.key(0)), 0.1 * jnp.ones(16), jax.random.key(1)
+    one = functools.partial(env.step, config, curriculum=curriculum.init(config))
+    alone = jax.jit(jax.vmap(one))(*jax.tree.map(lambda x: x[None], args))
+    for a, b, c in zip(*map(jax.tree.leaves, (one(*args), step(*args), alone)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(b, c[0], rtol=1e-4, atol=1e-4)
 

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 import onnx
 import pytest
+import slow
 from states import ACTOR, MIRROR, XBOT
 
 from kslc_jax import (
@@ -75,6 +76,12 @@ def symmetric():
 
 @pytest.fixture(scope="module", params=["symmetric", "plain"])
 def policy(request):
+    return make_policy(request.param)
+
+
+@pytest.fixture(scope="module", params=["symmetric", *slow.cases("compiles again", "plain")])
+def acting(request):
+    """`policy` for tests that compile its golden trace."""
     return make_policy(request.param)
 
 
@@ -227,6 +234,7 @@ def test_orbax_has_to_be_asked_for(saved, tmp_path, capsys, monkeypatch):
     assert sorted(p.name for p in out.iterdir() if p.is_dir()) == ["meta", "params"]
 
 
+@pytest.mark.slow(reason="compiles the trials whose observations it records")
 def test_command_line(saved, tmp_path, capsys, monkeypatch):
     seen, recorded = [], export.recorded
     monkeypatch.setattr(export, "recorded", lambda p: seen.append(recorded(p)) or seen[0])
@@ -308,6 +316,7 @@ def controller_of(runner, path, states, i):
     return controller
 
 
+@pytest.mark.slow(reason="compiles a rollout; the golden trace has the same frames")
 def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajectory):
     """The runner has its own code for observations. All frames of one second are compared."""
     qpos, qvel = trajectory.physics.qpos, trajectory.physics.qvel
@@ -320,6 +329,7 @@ def test_the_runners_frames_are_the_packages(runner, policy, onnx_file, trajecto
             np.testing.assert_allclose(controller.history, history, atol=1e-5)
 
 
+@pytest.mark.slow(reason="compiles a rollout")
 def test_the_runner_moves_as_the_package_does(runner, onnx_file, trajectory):
     """The runner simulates 0.8 s alone: actions, torques, servos, physics steps. Its model is the
     package's, where parts meet: the legs of a random policy do."""
@@ -341,25 +351,28 @@ def checker():
 
 
 @pytest.fixture(scope="module")
-def contracted(policy, onnx_file):
+def contracted(acting, tmp_path_factory):
     """The exported file with its data, robot and a golden trace of a second beside it."""
+    onnx_file = tmp_path_factory.mktemp("contract") / "policy.onnx"
+    onnx_file.write_bytes(export.to_onnx(acting))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(contract, "golden", functools.partial(contract.golden, seconds=1.0))
-        written = contract.write(policy, onnx_file)
+        written = contract.write(acting, onnx_file)
     assert [path.name for path in written] == ["policy.json", "policy.xml", "policy.npz"]
     return onnx_file
 
 
-def test_a_golden_trace_is_what_its_policy_does(policy, contracted):
-    trace = np.load(contracted.with_suffix(".npz"))
+def test_a_golden_trace_is_what_its_policy_does(acting, contracted):
+    policy, trace = acting, np.load(contracted.with_suffix(".npz"))
     np.testing.assert_allclose(trace["command"][:, 0], np.array([0, 0.25, 0.5]) * V_MAX, rtol=1e-6)
     assert trace["steps"].min() > 50 and trace["target"].shape == (3, 100, 16)
     clock = np.abs(trace["frame"][:, 0, :2]).max(axis=1)  # off while it stands
     assert (clock > 0.5).tolist() == [not policy.config.command.stand_still, True, True]
     frames = np.zeros((3, *policy.init().history.shape), np.float32)
+    act = jax.jit(jax.vmap(policy.act_on))
     for step in range(int(trace["steps"].min())):
         frames = np.concatenate([frames[:, 1:], trace["frame"][:, step, None]], axis=1)
-        action = np.clip(np.asarray(jax.vmap(policy.act_on)(frames)), -18, 18)
+        action = np.clip(np.asarray(act(frames)), -18, 18)
         held = policy.config.env.arms == "held"
         action[:, XBOT.is_arm] *= not held
         np.testing.assert_allclose(trace["action"][:, step], action, atol=1e-5)
@@ -434,7 +447,7 @@ def test_motor_torque_is_the_packages(runner, symmetric, xbot):
     )
 
 
-def test_the_runner_alone(onnx_file, tmp_path):
+def test_the_runner_alone(contracted, tmp_path):
     """In a separate process, outside the repository, without JAX and kslc_jax."""
     check = (
         "import runpy, sys; sys.argv = sys.argv[1:];"
@@ -442,7 +455,7 @@ def test_the_runner_alone(onnx_file, tmp_path):
         "assert not {'jax', 'kslc_jax', 'flax', 'onnx'} & set(sys.modules)"
     )
     done = subprocess.run(
-        [sys.executable, "-c", check, str(RUNNER), str(onnx_file), "--seconds", "4"],
+        [sys.executable, "-c", check, str(RUNNER), str(contracted), "--seconds", "4"],
         capture_output=True, text=True, cwd=tmp_path, check=False, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

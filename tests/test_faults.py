@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import slow
 from processes import METRICS
 
 from kslc_jax import (
@@ -61,10 +62,7 @@ def made():
     return init, step.lower(init()).compile()
 
 
-@pytest.fixture(
-    scope="module",
-    params=["mujoco", pytest.param("mjx", marks=pytest.mark.slow(reason="compiles MJX"))],
-)
+@pytest.fixture(scope="module", params=["mujoco", *slow.cases("compiles MJX", "mjx")])
 def either(request, made):
     """`made` with each engine."""
     if request.param == "mujoco":
@@ -149,7 +147,7 @@ class TestEnvironments:
         kept = [[x[others] for x in environments] for environments in (numbers(new.env), healthy)]
         assert same(*kept)
 
-    @pytest.mark.parametrize("value", [jnp.nan, jnp.inf])
+    @pytest.mark.parametrize("value", [jnp.nan, *slow.cases("masked like NaN", jnp.inf)])
     @pytest.mark.parametrize("where", SEEN_AT_ONCE)
     def test_one(self, either, healthy, where, value):
         self.assert_contained(either, healthy, where, value, slice(3, 4), lost=1)
@@ -338,6 +336,7 @@ class TestGoingBack:
             state, metrics = step(state)
             assert float(metrics["ppo/learning_rate"]) <= low * ppo.CEILING_GROWTH**i * 1.00001
 
+    @pytest.mark.slow(reason="compiles the rollout step by step")
     def test_replay_shows_where(self, made, tmp_path, capsys, monkeypatch):
         """A number that overflows in the first control step, in one environment."""
         monkeypatch.setattr(train_step, "make", lambda config: made)
@@ -458,7 +457,13 @@ class TestAround:
 
     @pytest.mark.parametrize(
         ("name", "at", "last"),
-        [("SIGUSR1", 4, 5), ("SIGTERM", 4, 6), ("SIGUSR1", 8, 8), ("SIGTERM", 8, 8)],
+        [
+            ("SIGUSR1", 4, 5),
+            *slow.cases(
+                "two trainings with many saves",
+                *(("SIGTERM", 4, 6), ("SIGUSR1", 8, 8), ("SIGTERM", 8, 8)),
+            ),
+        ],
     )
     def test_signals_while_it_saves(self, name, at, last, training, monkeypatch, capsys):
         """Nothing is lost. SIGUSR1 comes twice: before the save that begins after train step `at`,
@@ -707,6 +712,7 @@ def test_no_checkpoint_names_a_folder(save, restored, tmp_path):
 
 
 class TestFullDisk:
+    @pytest.mark.slow(reason="on a mounted disk; below is a quicker full disk")
     def test_save_fails_in_one_line_and_leaves_nothing(self, saved, restored, state_at, disk):
         saved(disk, 1)
         (disk / "filler").write_bytes(bytes(shutil.disk_usage(disk).free - 60_000))
@@ -815,7 +821,9 @@ def flip_bits(folder):
 
 
 class TestDamage:
-    @pytest.mark.parametrize("item", ["params", "core", "env"])
+    @pytest.mark.parametrize(
+        "item", ["params", *slow.cases("orbax reads them like params", "core", "env")]
+    )
     def test_flipped_bits(self, saved, save, restored, tmp_path, item):
         """The bits are in the numbers, where orbax itself finds no error."""
         saved(tmp_path, 1, 2)
@@ -1112,6 +1120,7 @@ class TestNoPickle:
                 allowed = {k.arg: ast.unparse(k.value) for k in node.keywords}
                 assert allowed.get("allow_pickle", "False") == "False"
 
+    @pytest.mark.slow(reason="reads a checkpoint once for each of its files")
     def test_a_pickle_in_place_of_any_file_does_nothing(self, saved, restored, tmp_path):
         source = saved(tmp_path / "source", 1)
         mark = tmp_path / "mark"
@@ -1247,6 +1256,7 @@ def twenty_steps(init, step):
 
 
 class TestDeterminism:
+    @pytest.mark.slow(reason="sixty train steps; of the physics alone test_physics says it")
     def test_two_inits_and_any_number_of_threads(self, made, monkeypatch):
         """Metrics and state are bit-identical. The step is compiled once; only the simulator's
         number of threads changes."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import slow
 
 from kslc_jax import config as config_lib
 from kslc_jax import (
@@ -180,7 +181,7 @@ def forces(config: PhysicsConfig, state: physics.PhysicsState) -> np.ndarray:
 
 
 class TestBothModels:
-    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("kind", [KINDS[0], *slow.cases("compiles both again", *KINDS[1:])])
     def test_a_robot_stands_in_the_same_way(self, kind):
         """Own planes in training, a height field at high fidelity: pose and forces agree."""
         train, high = PhysicsConfig(engine="mujoco", terrain=ALL), HighFidelity(terrain=only(kind))

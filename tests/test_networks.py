@@ -6,23 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from states import ACTOR, CRITIC, MIRROR, XBOT
+from states import ACTOR, CRITIC, MIRROR, XBOT, random_params
 
 from kslc_jax import networks, observations
 from kslc_jax.config import ConfigError, NetworkConfig, preset
 
 CONFIG = preset("debug")
 KEY = jax.random.key(3)
-
-
-def perturbed(config):
-    """Initial parameters plus noise, so that none has its special initial value."""
-    params = networks.init(config, KEY)
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(KEY, len(leaves))
-    return jax.tree.unflatten(
-        tree, [x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
-    )
 
 
 def mirrored(table, frames):
@@ -49,7 +39,7 @@ def test_parity_splits_every_vector(mirror):
 
 
 def test_value_of_a_mirrored_robot_is_the_same():
-    params = perturbed(CONFIG)
+    params = random_params(CONFIG)
     table = observations.critic_table(XBOT, CONFIG.env.critic_memory)
     shape = 5, CONFIG.env.privileged_frames, observations.width(table)
     frames = jax.random.normal(KEY, shape)
@@ -60,7 +50,7 @@ def test_value_of_a_mirrored_robot_is_the_same():
 
 
 def test_action_of_a_mirrored_robot_is_mirrored_for_any_weights():
-    params = perturbed(CONFIG)
+    params = random_params(CONFIG)
     history = jax.random.normal(KEY, (5, CONFIG.env.frames, observations.actor_width(XBOT)))
     here = networks.policy(CONFIG, params, history).mean
     there = networks.policy(CONFIG, params, mirrored(ACTOR, history)).mean
@@ -71,7 +61,7 @@ def test_action_of_a_mirrored_robot_is_mirrored_for_any_weights():
 
 def test_symmetric_networks_have_half_the_weights():
     def size(config):
-        actor = networks.init(config, KEY)["actor"]
+        actor = jax.eval_shape(lambda: networks.init(config, KEY))["actor"]
         return sum(x.size for x in jax.tree.leaves(actor) if x.ndim == 2)
 
     free = dataclasses.replace(CONFIG.network, symmetric=False)
@@ -108,7 +98,7 @@ def test_networks_have_the_papers_sizes():
 def test_the_estimate_mirrors_and_only_its_own_error_trains_it():
     """In the mirror vy changes its sign. The actor reads the estimate, but the actor's gradient
     does not reach the estimator."""
-    params = perturbed(CONFIG)
+    params = random_params(CONFIG)
     history = jax.random.normal(KEY, (CONFIG.env.frames, observations.actor_width(XBOT)))
     here = networks.estimate(CONFIG, params, history)
     there = networks.estimate(CONFIG, params, mirrored(ACTOR, history))

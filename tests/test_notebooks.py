@@ -82,6 +82,7 @@ def test_quickstart(execute):
     assert ("video/mp4" in nbformat.writes(notebook)) == drawn
 
 
+@pytest.mark.slow(reason="starts a kernel")
 def test_quickstart_where_nothing_can_be_drawn(tmp_path, monkeypatch):
     """If GL is installed but does not work, the notebook prints a line and does not fail."""
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
@@ -150,6 +151,7 @@ def test_the_reward_terms_shown_are_there_and_told():
     assert all(f"\n- `{name}`: " in prose for name in others)
 
 
+@pytest.mark.slow(reason="starts a kernel")
 def test_without_a_checkout_the_address_is_asked_for(tmp_path, monkeypatch):
     """The error asks for the address, instead of git's error about a missing repository. All
     notebooks have the same cell."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+import slow
 from states import XBOT
 
 from kslc_jax import maths, motors, physics, randomize, robot
@@ -17,7 +18,7 @@ from kslc_jax.config import XBOT_L, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.robots import description
 
 ENGINES = ("mjx", "mujoco")
-QUICK_FIRST = ("mujoco", pytest.param("mjx", marks=pytest.mark.slow(reason="compiles MJX again")))
+QUICK_FIRST = ("mujoco", *slow.cases("compiles MJX again", "mjx"))
 """Engines of tests that compile a program of their own; `runs` compares the engines."""
 GROUND = 0.6
 
@@ -146,7 +147,7 @@ def test_servo_control_inverts_the_models_servo(xbot):
 @pytest.mark.parametrize(
     "config",
     [
-        pytest.param(PhysicsConfig(engine="mjx"), marks=pytest.mark.slow(reason="compiles MJX")),
+        *slow.cases("compiles MJX", PhysicsConfig(engine="mjx")),
         PhysicsConfig(engine="mujoco"),
         HighFidelity(),
     ],
@@ -420,7 +421,8 @@ def step_with_x64(engine: str) -> None:
         step(state, None)
 
 
-@pytest.mark.parametrize("engine", QUICK_FIRST)
+@pytest.mark.slow(reason="a process of its own")
+@pytest.mark.parametrize("engine", ENGINES)
 def test_a_program_that_enables_x64_can_step(engine):
     """A script may need float64 for other things. The state keeps its dtypes, so it can be scanned
     over. Traced only: that is where a wrong dtype shows, and compiling takes long.

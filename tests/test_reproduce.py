@@ -5,10 +5,10 @@ import math
 import types
 
 import jax
-import numpy as np
 import pytest
+from states import still_policy
 
-from kslc_jax import curriculum, files, networks, records, reproduce, runtime
+from kslc_jax import files, records, reproduce, runtime
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import preset
 from kslc_jax.training import loop
@@ -18,16 +18,17 @@ from kslc_jax.training.recovery import NumbersError
 @pytest.fixture
 def shipped(tmp_path, monkeypatch):
     """A shipped policy that always commands the default pose. It falls soon."""
-    config = preset("debug")
-    params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    policy = policy_lib.Policy(config, params, curriculum.init(config), 7)
     monkeypatch.setattr(policy_lib, "POLICIES", tmp_path)
-    policy_lib.save_policy(policy, tmp_path / "still")
+    policy_lib.save_policy(still_policy(preset("debug"), step=7), tmp_path / "still")
     return tmp_path / "still"
 
 
+def rows_of(survival):
+    return [{"command": 1.0, "survival": survival, "forward_mean": 0.0}]
+
+
 def evaluation(survival, fidelity="train"):
-    rows = [{"command": 1.0, "survival": survival, "forward_mean": 0.0}]
+    rows = rows_of(survival)
     return json.dumps({"seeds": 2, "seconds": 3.0, "fidelity": fidelity, "rows": rows})
 
 
@@ -49,8 +50,17 @@ def test_milestones_may_be_half_as_late_again():
     assert math.isinf(rows[2][2])
 
 
+@pytest.mark.slow(reason="compiles trials")
+def test_a_real_trial_is_compared(shipped, capsys):
+    """In 3 s the policy falls, as its evaluation says."""
+    (shipped / files.EVALUATION).write_text(evaluation(0.0))
+    assert reproduce.main(["still"]) == 0
+    assert "all 2 numbers lie within" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("survival", "code"), [(0.0, 0), (1.0, 1)])
-def test_a_shipped_policy_is_tried_again(shipped, survival, code, capsys):
+def test_a_shipped_policy_is_tried_again(shipped, survival, code, monkeypatch, capsys):
+    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
     (shipped / files.EVALUATION).write_text(evaluation(survival))
     assert reproduce.main(["still"]) == code
     said = capsys.readouterr().out
@@ -70,6 +80,7 @@ def test_nothing_to_compare_with_is_one_line(shipped, capsys):
 def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
     (shipped / files.EVALUATION).write_text(evaluation(0.0))
     (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
+    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
     asked = []
 
     def fake(args, config, until):
@@ -83,7 +94,9 @@ def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
 
 @pytest.fixture
 def trained(shipped, monkeypatch):
-    """A fake training of `shipped`. `outcome` sets the share of its steps and its error."""
+    """A fake training of `shipped`. `outcome` sets the share of its steps and its error. The
+    evaluation is as it was."""
+    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
     (shipped / files.EVALUATION).write_text(evaluation(0.0))
     (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
     outcome = {"steps": 1.0, "raises": None}

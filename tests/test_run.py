@@ -152,14 +152,9 @@ def wait_until(ready, process):
 
 @pytest.mark.parametrize(
     "sig",
-    [
-        signal.SIGKILL,
-        *(
-            pytest.param(s, marks=pytest.mark.slow(reason="half a minute, like SIGKILL"))
-            for s in (signal.SIGTERM, signal.SIGHUP)
-        ),
-    ],
+    [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP],
 )
+@pytest.mark.slow(reason="half a minute each: a process that compiles; a stop above does not")
 def test_killed_run_resumes_with_the_same_numbers(sig, tmp_path):
     """A run is killed and resumed from its last checkpoint. Its numbers equal the run without a
     kill."""

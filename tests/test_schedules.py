@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from states import still_policy
 
-from kslc_jax import curriculum, networks
+from kslc_jax import curriculum
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import reaction, schedules, trained, trials
 from kslc_jax.evaluation.perturbations import Variation
@@ -142,12 +143,10 @@ def test_an_unknown_name_lists_the_known_ones():
 
 @pytest.fixture(scope="module")
 def still():
-    """A policy that asks for the default pose whatever it sees."""
-    config = preset("debug")
-    params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    return Policy(config, params, curriculum.init(config), 0)
+    return still_policy(preset("debug"))
 
 
+@pytest.mark.slow(reason="compiles a trial; test_viewer.py has another with a schedule")
 def test_a_trial_follows_its_schedule_from_any_heading(still):
     """Both in one program: the number of programs is what a sweep waits for."""
     schedule = schedules.Schedule(

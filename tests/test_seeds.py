@@ -154,6 +154,7 @@ def test_a_stopped_training_goes_on_as_a_whole(training, capsys):
     assert "nothing to do" in out
 
 
+@pytest.mark.slow(reason="two trainings of three seeds, each with many saves")
 def test_a_kill_between_two_saves_leaves_seeds_at_different_steps(training, capsys):
     """Each goes on from its own checkpoint; one without any begins. No record is lost or double."""
     training.saved_at = (3,)
@@ -167,6 +168,7 @@ def test_a_kill_between_two_saves_leaves_seeds_at_different_steps(training, caps
     assert [checkpoint.Store(f).steps()[-1] for f in training.folders] == [STEPS] * COUNT
 
 
+@pytest.mark.slow(reason="three trainings of three seeds")
 def test_a_bad_seed_stops_alone_and_is_named(training, capsys):
     training.saved_at = (3, 4)
     assert training(bad_from(3, 1), "--seeds", COUNT) == 1
@@ -186,6 +188,7 @@ def test_a_bad_seed_stops_alone_and_is_named(training, capsys):
     assert steps_of(training.folders[1]) == list(range(1, STEPS + 1))
 
 
+@pytest.mark.slow(reason="two trainings of three seeds, each with many saves")
 def test_a_bad_seed_far_behind_does_not_keep_the_others(training, capsys):
     """They end at their last train step, and then nobody waits for the bad one."""
     training.saved_at = (2, 3)
@@ -200,6 +203,7 @@ def test_a_bad_seed_far_behind_does_not_keep_the_others(training, capsys):
         assert checkpoint.Store(folder).steps()[-1] == STEPS
 
 
+@pytest.mark.slow(reason="two trainings of three seeds, each with many saves")
 def test_a_seed_that_cannot_be_saved_does_not_end_the_others(training, monkeypatch, capsys):
     finish = recorder.Recorder.finish
 

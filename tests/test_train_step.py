@@ -74,6 +74,7 @@ def test_metrics_are_finite_and_named(made):
     assert terms == {f.name for f in dataclasses.fields(config.rewards.weights)}
 
 
+@pytest.mark.slow(reason="compiles a rollout; below, windows give the means of the samples")
 def test_gathered_windows_equal_stacked_histories(made):
     """Histories rebuilt from single frames equal those that the actor saw, also across resets."""
     config, init, _ = made

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from states import ACTOR
+import slow
+from states import ACTOR, still_policy
 
-from kslc_jax import commands, curriculum, env, evaluate, networks, observations
+from kslc_jax import commands, env, evaluate, observations
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
 from kslc_jax.evaluation import gait_metrics, trials
@@ -22,18 +23,12 @@ C_MUJOCO = PhysicsConfig(engine="mujoco")
 
 @pytest.fixture(scope="module")
 def still():
-    """A policy that asks for the default pose whatever it sees."""
-    config = dataclasses.replace(preset("debug"), physics=C_MUJOCO)
-    params = jax.tree.map(np.zeros_like, networks.init(config, jax.random.key(0)))
-    return policy_lib.Policy(config, params, curriculum.init(config), 0)
+    return still_policy(dataclasses.replace(preset("debug"), physics=C_MUJOCO))
 
 
 @pytest.mark.parametrize(
     "physics",
-    [
-        HighFidelity(),
-        pytest.param(C_MUJOCO, marks=pytest.mark.slow(reason="compiles, like high fidelity")),
-    ],
+    [HighFidelity(), *slow.cases("compiles, like high fidelity", C_MUJOCO)],
 )
 def test_servos_alone_stand_a_second_and_then_fall(still, physics):
     """Bare servos fall after about two seconds at either fidelity; what fell stays fallen."""
@@ -68,10 +63,10 @@ def test_commands_hold(still):
     config = trials.trial_config(still.config, setting, 2)
     assert config.command.resample_seconds >= 10.0 and config.env.noise_level == 0.0
     assert config.randomize.push_seconds == 0.0
-    step = jax.jit(env.step, static_argnums=0)
+    reset, step = (jax.jit(x, static_argnums=0) for x in (env.reset, env.step))
     at = observations.slices(ACTOR)["command"]
     for wanted in ([1.5, 0.0, 0.0], [0.5, -0.3, 0.0], [1.0, 0.0, 0.4]):
-        state = env.reset(config, jax.random.key(1), still.curriculum)
+        state = reset(config, jax.random.key(1), still.curriculum)
         for i in range(1, 4):
             state = trials.with_command(config, state, jnp.array(wanted))
             state, _ = step(config, state, jnp.zeros(16), jax.random.key(2), still.curriculum)
@@ -214,8 +209,8 @@ def test_arms_momentum_is_theirs_alone(xbot):
 
 
 def test_sweep_and_table(still):
-    """Of four robots, so that it needs no other program than the trials of the servos."""
-    args = evaluate.Args("still", speeds=(0.0, 1.0), seeds=2, seconds=3.0)
+    """Of four robots at high fidelity, like the trials of the servos: the same program."""
+    args = evaluate.Args("still", speeds=(0.0, 1.0), seeds=2, seconds=3.0, fidelity="high")
     rows = evaluate.sweep(args, still)
     assert [r["command"] for r in rows] == [0.0, 1.0]
     assert all(r["survival"] == 0.0 for r in rows)
@@ -310,6 +305,7 @@ def test_limbs_turn_with_the_body(xbot):
     assert m["arms_momentum_yaw_rms"] == pytest.approx(0.603, abs=0.01)
 
 
+@pytest.mark.slow(reason="compiles; the quick suite pins what the policy does in a second")
 def test_the_shipped_policy_walks_and_runs():
     """4 s, of which 2 s count: at 3 m/s it is still gathering speed."""
     policy = policy_lib.load_policy("xbot_l_run")

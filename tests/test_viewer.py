@@ -17,9 +17,10 @@ import mujoco
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from states import still_policy
 
 import kslc_jax.viewer
-from kslc_jax import config, curriculum, files, networks, play, robot
+from kslc_jax import config, files, play, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import PhysicsConfig, preset
 from kslc_jax.evaluation import schedules, trials
@@ -31,13 +32,14 @@ BROWSERS = ("chromium-headless-shell", "chromium", "google-chrome")
 
 @pytest.fixture(scope="module")
 def still():
-    """A policy that always commands the default pose, and always starts in the same pose. All tests
-    use its config, so that they share the compiled programs."""
+    """`still_policy` that always starts in the same pose. All tests use its config, so that they
+    share the compiled programs."""
     base = preset("debug")
     env = dataclasses.replace(base.env, reset_joint_noise=0.0)
     quiet = dataclasses.replace(base, env=env, physics=C_MUJOCO)
-    params = jax.tree.map(np.zeros_like, networks.init(quiet, jax.random.key(0)))
-    return policy_lib.Policy(quiet, params, curriculum.init(quiet), 0)
+    made = still_policy(quiet)
+    # On a named device, like the loaded parameters of `viewer`: both run the same programs.
+    return dataclasses.replace(made, params=jax.device_put(made.params, jax.devices()[0]))
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +101,13 @@ def in_the_air(live, yaw):
     qpos = memory.env.physics.qpos.at[2].add(5.0).at[3:7].set(np.array(turn))
     lifted = memory.env.replace(physics=memory.env.physics.replace(qpos=qpos))
     live._memory, live.view = memory.replace(env=lifted), live.view.replace(qpos=qpos)
+
+
+def topple(live):
+    """Lays the robot of a session on its side: it has fallen in the next step."""
+    memory, side = live._memory, np.array([0.15, np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+    lying = memory.env.physics.replace(qpos=memory.env.physics.qpos.at[2:7].set(side))
+    live._memory = memory.replace(env=memory.env.replace(physics=lying))
 
 
 def velocity_of_mass(live):
@@ -163,7 +172,9 @@ def test_a_session_follows_a_schedule_as_a_trial_does(still):
 
 def test_a_fallen_robot_starts_the_schedule_anew(still):
     live = session.Session(still, C_MUJOCO, schedule=MINE)
-    views = [live.advance() for _ in range(500)]
+    views = [live.advance() for _ in range(70)]
+    topple(live)
+    views += [live.advance() for _ in range(170)]
     fell = next(i for i, v in enumerate(views) if v.fallen)
     again = [v.command[0] for v in views[fell + 101 : fell + 161]]
     np.testing.assert_allclose(again, VX)
@@ -207,7 +218,9 @@ def test_a_session_walks_on_at_the_edge_and_a_fresh_one_stands(still):
 
 def test_a_fallen_robot_lies_a_second_and_starts_anew(still):
     live = session.Session(still, C_MUJOCO)
-    views = [live.advance(np.zeros(3)) for _ in range(500)]
+    views = [live.advance(np.zeros(3)) for _ in range(20)]
+    topple(live)
+    views += [live.advance(np.zeros(3)) for _ in range(120)]
     fell = next(i for i, v in enumerate(views) if v.fallen)
     lying = views[fell : fell + 101]
     assert all(v is lying[0] for v in lying) and lying[0].qpos[2] < 0.75
@@ -350,6 +363,8 @@ def test_the_page_says_when_it_is_too_slow(viewer, monkeypatch):
     """Frames come 0.2 s apart, and each simulates at most 0.1 s. This is half of real time: too
     slow at 1x, enough at 0.5x."""
     monkeypatch.setattr(viewer.server, "get_clients", lambda: {0: None})
+    view = viewer.session.view
+    monkeypatch.setattr(viewer.session, "advance", lambda *_: view)  # the robot does not matter
     titles = []
     monkeypatch.setattr(viewer.panel._gui, "set_panel_label", titles.append)
     viewer._paced.clear()
@@ -617,6 +632,7 @@ def test_where_nothing_can_be_written_nothing_is_simulated(tmp_path, monkeypatch
         play.draw(play.Args(Path("x"), video=tmp_path / "out.mp4"), None)
 
 
+@pytest.mark.slow(reason="a process of its own")
 def test_a_gl_that_does_not_work_is_named(tmp_path):
     command = [
         *(sys.executable, "-m", "kslc_jax.play", "xbot_l_run", "--speeds", "1", "--seconds", "0.1"),
