@@ -70,8 +70,16 @@ def _peak() -> int:
     import jax
 
     stats = jax.devices()[0].memory_stats() or {}
-    in_process = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    return stats.get("peak_bytes_in_use", in_process)
+    return stats.get("peak_bytes_in_use") or peak_of_process()
+
+
+def peak_of_process() -> int:
+    """Peak memory of this process [bytes]."""
+    with contextlib.suppress(OSError):  # Linux; `ru_maxrss` counts the parent before the exec, too
+        lines = Path("/proc/self/status").read_text().splitlines()
+        (peak,) = (line.split() for line in lines if line.startswith("VmHWM:"))
+        return 1024 * int(peak[1])
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def child(args: "Args", num_envs: int, frames: int) -> dict[str, float] | None:

@@ -213,6 +213,14 @@ def test_parts(tmp_path):
     assert seconds["physics"] > 0 and seconds["gradient steps"] > 0
 
 
+def test_the_peak_of_a_process_does_not_count_its_parent():
+    """The child has a tenth of the parent's memory."""
+    large = np.ones(2**27)  # 1 GiB
+    code = "from benchmarks import memory; print(memory.peak_of_process())"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 0.5 * large.nbytes < memory.peak_of_process()
+
+
 @pytest.mark.slow(reason="starts Python eight times")
 def test_compile_time_and_memory(tmp_path, capsys):
     path = tmp_path / "numbers.json"
