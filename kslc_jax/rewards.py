@@ -260,10 +260,14 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
     noise then adds on average the same amount for every mean action, and does not hide that the
     mean itself trembles. The noise is large in early training and would dominate the term. So these
     two grow with the commanded range, see `_exactness`. A robot that shuffles its feet creeps.
+
+    The cost of the feet is bounded. Without a bound, a robot that steps has a total below zero, all
+    of which counts as zero (`only_positive`), so nothing tells it what would be better.
     """
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
     unquiet = cfg.restless * _action_change(x)
-    unquiet += cfg.shuffle * jnp.sum(jnp.square(x.signals.foot_vel))
+    squared = jnp.sum(jnp.square(x.signals.foot_vel)) / cfg.shuffle_speed**2
+    unquiet += cfg.shuffle * (1.0 - jnp.exp(-squared))
     return jnp.where(x.command.moving, 0.0, moved + unquiet * _exactness(cfg, x))
 
 

@@ -101,7 +101,8 @@ def factors(robot: Robot) -> dict[str, float]:
         "rewards.joint_pos_penalty": math.sqrt(joints),
         "rewards.joint_pos_clip": 1.0 / math.sqrt(joints),
         "rewards.restless": math.sqrt(joints),  # within stand_still
-        "rewards.shuffle": 1.0 / (length * math.sqrt(joints)),  # the same
+        "rewards.shuffle": 1.0 / math.sqrt(joints),  # the same
+        "rewards.shuffle_speed": time,
         "rewards.weights.stand_still": math.sqrt(joints),
         "rewards.weights.dof_vel_limits": joints,
         "rewards.weights.feet_air_time": 1.0 / time,

@@ -109,7 +109,8 @@ def test_sums_over_joints_scale_with_their_number(biped):
         assert factors[f"rewards.weights.{term}"] == 16 / 9
     weight = factors["rewards.weights.stand_still"]
     assert weight * factors["rewards.restless"] == pytest.approx(16 / 9)
-    assert weight * factors["rewards.shuffle"] == pytest.approx(1 / biped.length_ratio)
+    assert weight * factors["rewards.shuffle"] == pytest.approx(1.0)
+    assert factors["rewards.shuffle_speed"] == pytest.approx(biped.length_ratio**0.5)
     assert factors["rewards.joint_pos_kernel"] == pytest.approx(4 / 3)
     assert similar.scaled(c, biped).rewards.joint_pos_clip == pytest.approx(0.375)
     assert factors["rewards.knee_distance"] == pytest.approx(0.2 / XBOT.knees_apart)

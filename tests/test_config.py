@@ -243,7 +243,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.base_height_drop": 0.0,
         "rewards.exact_full": 2.0,
         "rewards.restless": 0.6,
-        "rewards.shuffle": 50.0,
+        "rewards.shuffle": 2.0,
         "rewards.clearance_width": 0.03,
         "rewards.clearance_mid_swing": True,
         "rewards.clearance_speed_gain": 0.5,

@@ -399,11 +399,12 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         )
         for restless, v_max, value in ((0.0, 3.5, 0.7), (0.5, 3.5, 1.2), (0.5, 1.5, 0.95))
     ),
-    # `shuffle` adds 2 * (0.3^2 + 0.4^2 + 0.1^2) to 0.1 * 2, and half of that at v_max 1.5.
+    # `shuffle` adds 2 * (1 - 1 / e) to 0.1 * 2 for feet that move at `shuffle_speed`, here the root
+    # of 0.3^2 + 0.4^2 + 0.1^2, and half of that at v_max 1.5.
     *(
         (
             "stand_still",
-            dataclasses.replace(KSLC, shuffle=2.0),
+            dataclasses.replace(KSLC, shuffle=2.0, shuffle_speed=0.26**0.5),
             {
                 "moving": False,
                 "v_max": v_max,
@@ -412,7 +413,7 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
             },
             value,
         )
-        for v_max, value in ((3.5, 0.72), (1.5, 0.46))
+        for v_max, value in ((3.5, 1.464241), (1.5, 0.832121))
     ),
     (
         "stand_still",
@@ -516,6 +517,28 @@ def test_reward_is_never_negative_unless_asked():
     assert float(rewards.evaluate(cfg, robot.load(), DT, x)[0]) == 0.0
     free = dataclasses.replace(cfg, only_positive=False)
     assert float(rewards.evaluate(free, robot.load(), DT, x)[0]) == pytest.approx(-0.004, rel=1e-4)
+
+
+def test_marching_at_command_0_still_earns_something():
+    """Below zero every behaviour is worth the same, and standing cannot be learnt. A foot swings at
+    1 m/s, and the actions have the noise of the middle of a training: deviation 0.4."""
+    rng = np.random.default_rng(0)
+    action, last, before = 0.4 * rng.normal(size=(3, 16))
+    total, terms = evaluate(
+        preset("laptop").rewards,
+        make_inputs(
+            moving=False,
+            v_max=4.5,
+            foot_vel=[[0.9, 0.0, 0.4], [0.0, 0.0, 0.0]],
+            foot_contact=[False, True],
+            joint_vel=joints(left_leg_pitch=3.0, left_knee=4.0),
+            joint_pos=joints(left_leg_pitch=0.2, left_knee=-0.4, left_ankle_pitch=0.2),
+            action=action,
+            last_action=last,
+            last_last_action=before,
+        ),
+    )
+    assert float(total) > 0.01 and float(terms["stand_still"]) > 3.0
 
 
 @pytest.mark.parametrize("cfg", [KSLC, HG], ids=["kslc", "hg"])

@@ -115,7 +115,7 @@ _LAPTOP = _override(
         "lean_per_speed": 0.03,
         "exact_full": 2.0,
         "restless": 0.6,
-        "shuffle": 50.0,
+        "shuffle": 2.0,
         "weights": {
             "feet_contact_number": 2.0,
             "feet_clearance": 0.7,

@@ -100,7 +100,9 @@ class RewardConfig:
     restless: float = 0.0
     """Weight of squared action changes within the term `stand_still`, at full size."""
     shuffle: float = 0.0
-    """Weight of the squared speeds of the feet [m^2/s^2] within `stand_still`, at full size."""
+    """Weight of moving feet within `stand_still`, at full size."""
+    shuffle_speed: float = 0.2
+    """Speed of the feet [m/s] at which `shuffle` costs 0.63 of its weight; faster feet cost all."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which `dof_vel_limits` counts."""
 
@@ -109,6 +111,7 @@ class RewardConfig:
         require(self.momentum_floor < 0, "rewards.momentum_floor must be negative")
         require(self.clearance_width > 0, "rewards.clearance_width must be positive")
         require(self.max_contact_force >= 0, "rewards.max_contact_force must not be negative")
+        require(self.shuffle_speed > 0, "rewards.shuffle_speed must be positive")
         require(self.exact_from < self.exact_full, "rewards.exact_from must lie below exact_full")
         check_range("rewards.feet_distance", self.feet_distance)
         check_range("rewards.knee_distance", self.knee_distance)
