@@ -235,8 +235,9 @@ def metrics_of(
 ) -> Metrics:
     """Scalars of one train step.
 
-    `reward/...` are unweighted terms. `broken` is the share of masked samples. `finite` is 1 if all
-    numbers of the learner and the curriculum are finite, else 0.
+    `reward/...` are unweighted terms. `broken` is the share of masked samples. `no_reward` is the
+    share of samples that earn nothing: their costs are larger than the rest (`only_positive`).
+    `finite` is 1 if all numbers of the learner and the curriculum are finite, else 0.
     """
     terms = {f"reward/{name}": jnp.mean(value) for name, value in out.terms.items()}
     return {
@@ -248,6 +249,7 @@ def metrics_of(
         "falls": jnp.mean(out.terminated),
         "broken": jnp.mean(out.broken),
         "finite": finite((state.learner, state.curriculum)).astype(jnp.float32),
+        "no_reward": jnp.mean((out.reward <= 0.0) & ~out.broken),
         "speeding": jnp.mean(out.speeding),
         "curriculum/v_max": state.curriculum.v_max,
         "curriculum/cycle_time": state.curriculum.cycle_time,

@@ -211,6 +211,24 @@ def test_robots_start_unlike_each_other(made):
     assert len(np.unique(env.command.heading)) > 8
 
 
+def test_samples_whose_costs_exceed_what_they_earn_are_counted(made):
+    """Two of six; the last one is broken, which `broken` counts."""
+    config, init, _ = made
+    blank = jnp.zeros(6)
+    out = env.Outcome(**dict.fromkeys(env.Outcome.__dataclass_fields__, blank)).replace(
+        reward=jnp.array([0.0, 0.1, 0.0, 0.2, 0.3, 0.0]),
+        broken=jnp.arange(6) == 5,
+        terms={"tracking_lin_vel": blank, "feet_contact_number": blank},
+        **dict.fromkeys(
+            ("settled", "fast", "top", "braking", "terminated", "truncated"), blank > 0
+        ),
+    )
+    progress = train_step.progress_of(config, out)
+    metrics = train_step.metrics_of(config, init(), out, progress, {})
+    assert float(metrics["no_reward"]) == pytest.approx(2 / 6)
+    assert float(metrics["broken"]) == pytest.approx(1 / 6)
+
+
 def test_slow_commands_at_the_top_count_as_if_they_were_faster():
     """Commands of 0.5 and 4.0 m/s give speeds of 0.4 and 4.3 m/s: deviation -0.1 + 0.3, scale 3.0 +
     4.0. The third command has not settled, and the others are not at the top. Three robots fall at
