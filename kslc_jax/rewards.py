@@ -256,13 +256,14 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
     """Joint motion, distance from the default pose, action changes and motion of the feet while
     standing (ours).
 
-    It is 0 while the command is to move. Action changes and foot speeds enter squared: exploration
-    noise then adds on average the same amount for every mean action, and does not hide that the
-    mean itself trembles. The noise is large in early training and would dominate the term. So these
-    two grow with the commanded range, see `_exactness`. A robot that shuffles its feet creeps.
+    It is 0 while the command is to move. Action changes enter squared: exploration noise then adds
+    on average the same amount for every mean action, and does not hide that the mean itself
+    trembles. Moving feet cost, because a robot that shuffles them creeps. The noise is large in
+    early training and would dominate the term. So these two grow with the commanded range, see
+    `_exactness`.
 
-    The cost of the feet is bounded. Without a bound, a robot that steps has a total below zero, all
-    of which counts as zero (`only_positive`), so nothing tells it what would be better.
+    The cost of the feet has a bound. Without one, the total of a robot that steps is below zero.
+    With `only_positive` it is then 0 whatever the robot does, so the robot cannot learn to stand.
     """
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
     unquiet = cfg.restless * _action_change(x)

@@ -260,10 +260,7 @@ def test_the_train_step_has_consistent_shapes(setup):
 
 @pytest.mark.slow(reason="compiles a trial")
 def test_a_trial_at_high_fidelity_has_all_metrics_but_those_of_arms(biped, untrained):
-    """Half a kilogram more in hands that it does not have changes nothing."""
-    setting = trials.Setting(
-        trials.engine(untrained, "high"), seconds=1.0, variation=Variation(hands=0.5)
-    )
+    setting = trials.Setting(trials.engine(untrained, "high"), seconds=1.0)
     assert setting.physics.robot == BIPED
     trace = trials.join(list(trials.run(untrained, setting, np.zeros((2, 3)))))
     assert trace.qpos.shape == (100, 2, 16) and trace.mass[0, 0] == pytest.approx(biped.total_mass)
@@ -272,6 +269,15 @@ def test_a_trial_at_high_fidelity_has_all_metrics_but_those_of_arms(biped, untra
     found = gait_metrics.summary(longer, 0.0, physics.robot_for(setting.physics), 0.01)
     assert {"knee_range_difference", "legs_momentum_rms", "stance_difference"} <= found.keys()
     assert not any("arm" in name or "shoulder" in name for name in found)
+
+
+@pytest.mark.slow(reason="compiles a trial")
+def test_a_robot_without_hands_carries_nothing_in_them(biped, untrained):
+    setting = trials.Setting(
+        trials.engine(untrained, "high"), seconds=0.01, variation=Variation(hands=0.5)
+    )
+    (trace,) = trials.run(untrained, setting, np.zeros((1, 3)), chunk=0.01)
+    assert trace.mass[0, 0] == pytest.approx(biped.total_mass)
 
 
 def test_a_policy_knows_its_robot(untrained, tmp_path):

@@ -32,6 +32,12 @@ def evaluation(survival, fidelity="train"):
     return json.dumps({"seeds": 2, "seconds": 3.0, "fidelity": fidelity, "rows": rows})
 
 
+@pytest.fixture
+def falls_again(monkeypatch):
+    """Trials without a simulation: the robot falls."""
+    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
+
+
 def test_bands():
     old = [{"command": 1.0, "survival": 1.0, "forward_mean": 0.98, "cost_of_transport": 1.0}]
     new = [{"command": 1.0, "survival": 1.0, "forward_mean": 0.92, "cost_of_transport": 9.0}]
@@ -59,8 +65,7 @@ def test_a_real_trial_is_compared(shipped, capsys):
 
 
 @pytest.mark.parametrize(("survival", "code"), [(0.0, 0), (1.0, 1)])
-def test_a_shipped_policy_is_tried_again(shipped, survival, code, monkeypatch, capsys):
-    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
+def test_a_shipped_policy_is_tried_again(shipped, falls_again, survival, code, capsys):
     (shipped / files.EVALUATION).write_text(evaluation(survival))
     assert reproduce.main(["still"]) == code
     said = capsys.readouterr().out
@@ -77,10 +82,9 @@ def test_nothing_to_compare_with_is_one_line(shipped, capsys):
         assert len(err) == 1 and err[0].startswith("error: ") and says in err[0]
 
 
-def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
+def test_training_again_is_compared(shipped, falls_again, tmp_path, monkeypatch, capsys):
     (shipped / files.EVALUATION).write_text(evaluation(0.0))
     (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
-    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
     asked = []
 
     def fake(args, config, until):
@@ -93,10 +97,8 @@ def test_training_again_is_compared(shipped, tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture
-def trained(shipped, monkeypatch):
-    """A fake training of `shipped`. `outcome` sets the share of its steps and its error. The
-    evaluation is as it was."""
-    monkeypatch.setattr(reproduce.evaluate, "sweep", lambda *_: rows_of(0.0))
+def trained(shipped, falls_again, monkeypatch):
+    """A fake training of `shipped`. `outcome` sets the share of its steps and its error."""
     (shipped / files.EVALUATION).write_text(evaluation(0.0))
     (shipped / files.MILESTONES).write_text(json.dumps({"1": 2000}))
     outcome = {"steps": 1.0, "raises": None}

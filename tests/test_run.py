@@ -150,11 +150,8 @@ def wait_until(ready, process):
     raise AssertionError("no progress")
 
 
-@pytest.mark.parametrize(
-    "sig",
-    [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP],
-)
 @pytest.mark.slow(reason="half a minute each: a process that compiles; a stop above does not")
+@pytest.mark.parametrize("sig", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
 def test_killed_run_resumes_with_the_same_numbers(sig, tmp_path):
     """A run is killed and resumed from its last checkpoint. Its numbers equal the run without a
     kill."""

@@ -82,15 +82,21 @@ def test_perturbations_reach_the_robot():
     assert sim2sim.setting(sim2sim.Args("x"), HighFidelity(), "imu=0.03").imu_offset == (0.03, 0.03)
 
 
-def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(random_policy, frozen):
+@pytest.mark.parametrize(
+    ("condition", "kg"),
+    [("payload=-5", -5), *slow.cases("compiles again", ("nominal", 0), ("payload=5", 5))],
+)
+def test_the_payload_is_in_the_mass_that_the_cost_of_transport_divides_by(
+    random_policy, frozen, condition, kg
+):
     """The trace's mass is that of the model which the engine steps: 53.036 kg and the payload."""
     setting = dataclasses.replace(
-        sim2sim.setting(sim2sim.Args("x"), HighFidelity(), "payload=-5"), seconds=0.03
+        sim2sim.setting(sim2sim.Args("x"), HighFidelity(), condition), seconds=0.03
     )
     trace = next(iter(trials.run(random_policy, setting, np.zeros((2, 3)), chunk=0.03)))
-    np.testing.assert_allclose(trace.mass, np.full((3, 2), 53.036 - 5.0), atol=1e-3)
+    np.testing.assert_allclose(trace.mass, np.full((3, 2), 53.036 + kg), atol=1e-3)
     xbot = robot.load("high")
-    fields = randomize.model_fields(xbot, dynamics("payload=-5")[0], 1.0)
+    fields = randomize.model_fields(xbot, dynamics(condition)[0], 1.0)
     assert float(fields["body_mass"].sum()) == pytest.approx(trace.mass[0, 0], abs=1e-4)
 
 
