@@ -9,7 +9,7 @@
 | `memory` | peak memory and speed over environments and frames |
 | `gpu` | `throughput` of several sizes and precisions on an accelerator, in one run |
 | `gpu --all` | five seeds in one program, bit-exactness, `paper`, larger batches, Brax |
-| `lent_gpu` | nothing: it trains five seeds for some minutes and carries the runs away |
+| `lent_gpu` | no measurement: it trains five seeds for a limited time and copies the runs |
 | `start_test`, `kill_test` | reliability, not speed: many starts, many kills |
 
 Each prints its results. The first five store the numbers with `--json`, and `gpu` with `--out`.

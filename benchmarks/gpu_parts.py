@@ -43,7 +43,7 @@ class Args:
     folder: Path | None = None
     """exact and resumed: folder of their checkpoint."""
     train_seconds: float = 0.0
-    """large: longest time [s] of each training; 0 trains none."""
+    """large: time [s] of this process, with compiling, that its trainings share; 0 trains none."""
 
 
 def _say(text: str) -> None:
@@ -174,7 +174,11 @@ def paper(args: Args) -> Numbers:
 
 
 def large(args: Args) -> Numbers:
-    """All programs compile at the same time. Trainings begin from new first states."""
+    """All programs compile at the same time. Trainings begin from new first states.
+
+    Each training gets an equal share of the time that is left after those before it.
+    """
+    ends = time.monotonic() + args.train_seconds
     from kslc_jax import train_step
 
     configs = larger(preset(args.preset))
@@ -186,8 +190,13 @@ def large(args: Args) -> Numbers:
     numbers: Numbers = {
         f"{name}, steps/s": configs[name].batch_size / s for name, s in seconds.items()
     }
-    for name, (_, program) in programs.items() if args.train_seconds else ():
-        took = until(SPEED, makes[name][0](), program, args.train_seconds)
+    for name, value in numbers.items():
+        _say(f"{name}: {value:.0f}")  # in case that a training is killed
+    waiting = list(programs.items()) if args.train_seconds else []
+    while waiting:
+        share = (ends - time.monotonic()) / len(waiting)
+        name, (_, program) = waiting.pop(0)
+        took = until(SPEED, makes[name][0](), program, share)
         numbers[f"{name}, seconds and train steps to {SPEED} m/s"] = took
         _say(f"{name}: {took}")
     return numbers
@@ -205,7 +214,10 @@ def larger(base: Config) -> dict[str, Config]:
 
 
 def until(speed: float, state: Any, program: Any, seconds: float) -> tuple[float, int] | None:
-    """(seconds, train steps) until the commands reach `speed`; None if `seconds` are too short."""
+    """(seconds, train steps) until the commands reach `speed` [m/s].
+
+    None if they do not within `seconds`.
+    """
     start = time.monotonic()
     while (now := time.monotonic() - start) < seconds:
         state, metrics = program(state)

@@ -54,7 +54,7 @@ def wait_until(what, process: subprocess.Popen, log: Path, seconds: float = 300.
     end = time.monotonic() + seconds
     while not what():
         if process.poll() is not None or time.monotonic() > end:
-            raise Failure(f"the training came to nothing:\n{log.read_text()}")
+            raise Failure(f"the training ended early, or the wait was too long:\n{log.read_text()}")
         time.sleep(0.001)
 
 

@@ -1,7 +1,7 @@
 """Five seeds on a GPU that is lent for some minutes, and a copy of the runs that can be carried.
 
-It trains until --seconds are over, then stops the training by SIGTERM, which saves. A SIGTERM to
-this command does the same. The whole runs stay in --run-dir and can be resumed there. The copy in
+It trains for --seconds. Then it sends SIGTERM; the training saves and exits. A SIGTERM to this
+command does the same. The whole runs stay in --run-dir and can be resumed there. The copy in
 --out leaves out the environments, which are most of a checkpoint: per seed it has the config, the
 metrics, all snapshots, and of the latest checkpoint the networks, optimiser and curriculum. So
 evaluate and plots work with it, and train --resume goes on with new environments.

@@ -101,7 +101,7 @@ def _message(box: str) -> str:
 
 
 def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
-    """Runs a command; returns its exit code.
+    """Runs a command; returns its exit code. Afterwards a notebook's process is as before.
 
     Args:
       do: does the command's work; returns its exit code, None for 0. A UserError prints one line
@@ -110,7 +110,9 @@ def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
         Output without a reader (a closed pipe or terminal) is no failure.
     """
     streams.open_missing()
-    with runtime.own_numerics(), streams.lasting() as output:
+    # A program ends after its command. Libraries may then still report errors, which stay silent.
+    hooks = contextlib.nullcontext() if runtime.is_program() else runtime.own_hooks()
+    with hooks, runtime.own_numerics(), streams.lasting() as output:
         runtime.prepare(gl=False)
         runtime.quiet()
         try:

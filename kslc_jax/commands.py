@@ -43,8 +43,8 @@ def sample(
     `vx_range` [m/s]. A share `slow_fraction` of the commands uses only the part up to `slow_speed`,
     and a share `top_fraction` only the uppermost `top_width` [m/s]. With `narrow_speed`, vy and the
     change of heading shrink linearly with |vx|. A share `stand_fraction` has zero velocity and
-    keeps its heading. A share `forward_fraction` goes straight ahead. After fast commands a share
-    `brake_fraction` stops or reverses.
+    keeps its heading. A share `forward_fraction` goes straight ahead. After commands of the upper
+    half of the range, a share `brake_fraction` stops or reverses.
     """
     before = standing(yaw) if before is None else before
     part, speed, sideways, turn, kind = jax.random.uniform(key, (5,))

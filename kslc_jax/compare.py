@@ -326,7 +326,8 @@ def _compare(args: Args) -> int:
     if failed:
         print(f"error: failed: {', '.join(failed)}; the same command tries again", file=sys.stderr)
     if refused:
-        print(f"error: left alone: {', '.join(refused)}; name another --out", file=sys.stderr)
+        what = f"another training is in {', '.join(refused)} and was kept"
+        print(f"error: {what}; name another --out", file=sys.stderr)
     return 1 if failed or refused else 0
 
 

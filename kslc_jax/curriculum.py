@@ -26,8 +26,9 @@ class Curriculum:
     fast_tracking: jax.Array  # [] the same, fast commands only (`Outcome.fast`)
     episode_steps: jax.Array  # [] moving average of the length of finished episodes
     gait: jax.Array  # [] moving average of feet_contact_number, fast commands, -0.3 to 1
-    top_deviation: jax.Array  # [] m/s, fading sum of vx - commanded vx, settled at the top
-    top_scale: jax.Array  # [] m/s, fading sum of max(commanded vx, `top_error_floor`), same
+    # Fading sums over the samples with a settled command at the top:
+    top_deviation: jax.Array  # [] m/s, of vx minus commanded vx
+    top_scale: jax.Array  # [] m/s, of max(commanded vx, `top_error_floor`)
     top_falls: jax.Array  # [] fading sum of falls under and soon after commands at the top
     top_minutes: jax.Array  # [] fading sum of minutes under commands at the top
     updates: jax.Array  # [] int, updates since the last change
@@ -44,8 +45,9 @@ class Progress:
     episode_steps: jax.Array  # [] mean length of the episodes that ended; see train_step.init
     episode_count: jax.Array  # [] number of these episodes
     gait: jax.Array  # [] mean of feet_contact_number over the samples with a fast command
-    top_deviation: jax.Array  # [] m/s, sum of vx - commanded vx, settled at the top
-    top_scale: jax.Array  # [] m/s, sum of max(commanded vx, `top_error_floor`), same samples
+    # Sums over the samples with a settled command at the top:
+    top_deviation: jax.Array  # [] m/s, of vx minus commanded vx
+    top_scale: jax.Array  # [] m/s, of max(commanded vx, `top_error_floor`)
     top_falls: jax.Array  # [] falls under commands at the top, and up to `falls_after` later
     top_minutes: jax.Array  # [] minutes under commands at the top, sum over the robots
 
@@ -109,7 +111,7 @@ def remaining_share(config: CurriculumConfig, state: Curriculum) -> jax.Array:
 def conditions(config: CurriculumConfig, state: Curriculum) -> dict[str, jax.Array]:
     """The conditions for the range to grow: name -> [] bool, True if the condition is met.
 
-    The last two are about commands at the top; a mean over all commands would hide them.
+    The last two are about commands at the top. A mean over all commands would hide failures there.
     """
     return {
         "tracking under all commands": state.tracking >= config.threshold,

@@ -95,7 +95,7 @@ def _target(path: Path) -> Path:
 
 
 def _is_device(path: Path) -> bool:
-    """True for what is there and no file, such as /dev/stdout; a folder counts, too."""
+    """True if the path exists and is no regular file: a device such as /dev/stdout, or a folder."""
     return path.exists() and not path.is_file()
 
 

@@ -30,7 +30,9 @@ class GaitState:
     air_time: jax.Array  # [2] s in the air, 0 if grounded (see `update`)
     landed_air_time: jax.Array  # [2] s, air time that ended at this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
-    mean_error: jax.Array  # [2] m/s, vx, vy less the command, mean over about one cycle, see update
+    mean_error: (
+        jax.Array
+    )  # [2] m/s, mean of vx, vy minus the command over about a cycle, base frame
     stance: jax.Array  # [2] bool, True: the clock wants this foot on the ground
     clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
 
@@ -69,8 +71,8 @@ def update(
 
     A foot is grounded if it has contact, had contact at the step before, or should have it by the
     clock (HG). When a foot becomes grounded, `landed_air_time` is its air time. While the command
-    approaches the wanted one, its error does not count in `mean_error`: no robot follows such a
-    ramp exactly, and a robot that makes up for it later would overshoot.
+    approaches the wanted one, the error counts as 0 in `mean_error`. Otherwise the robot's lag
+    would stay in the mean, and only an overshoot could cancel it.
     """
     phase = jnp.mod(state.phase + dt / cycle_time, 1.0)
     clock, stance = clock_of(config, phase, command)

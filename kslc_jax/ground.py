@@ -18,18 +18,21 @@ PERIOD = 12.0
 """Distance [m] after which the shape of the ground repeats, along both axes of its own frame."""
 
 START, ROUND = 0.6, 0.1
-"""Radius [m] of the flat place where an episode starts, and half width [m] of its round edge."""
+"""Radius [m] of the flat place where an episode starts, to the middle of its round edge, and half
+the width [m] of this edge. So the ground is flat up to 0.5 m from the start."""
 
 BLEND = 5.0
-"""Distance [m] from the start at which the ground is as if there were no flat place. Nearer it is
-up to a fifth steeper, to make up for that place. It lies within half a `PERIOD`."""
+"""Distance [m] from the start beyond which the flat place has no effect, at most half a `PERIOD`.
+The flat place shifts the shape outwards. From there to this distance the shape catches up, and
+slopes are up to a fifth steeper."""
 
 TREAD, RISER, EDGE = 0.4, 0.05, 0.01
 """Length of a stair [m], the part of it that rises [m], and half width of its round edges [m]. A
 `PERIOD` has a whole number of stairs."""
 
 RISER_AT = 0.175
-"""Middle of the riser from the middle of the first stair [m]: risers begin and end on `SPACING`."""
+"""Distance [m] of a riser's middle from the middle of its stair, so that risers begin and end at
+whole multiples of `SPACING`."""
 
 SPACING, HALF = 0.05, PERIOD
 """Distance of the points of a height field [m], and half its length [m].
@@ -46,7 +49,8 @@ _PHASES = np.array([0.0, 3.88, 1.48, 5.37, 2.97, 0.57, 4.45, 2.06], np.float32) 
 
 @flax.struct.dataclass
 class Ground:
-    """The ground of one episode. All but one of the first three are 0."""
+    """The ground of one episode. In an episode of training at most one of the first three is not
+    0."""
 
     rough: jax.Array  # [] m, height of the largest wave
     slope: jax.Array  # [] rise per metre

@@ -4,8 +4,8 @@ Compare several seeds: python -m kslc_jax.judge seed0.json seed1.json seed2.json
 A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fidelity: at each
 commanded speed, under random changes of the command from four starting headings (16 robots whose
 masses, motors and friction differ), and with each perturbation of sim2sim. A robot of another size
-than XBot-L gets other speeds and perturbations, by dynamic similarity. --harsh adds shoves, arms
-that somebody else moves, and uneven ground. Prints one table: each bar,
+than XBot-L gets other speeds and perturbations, by dynamic similarity. --harsh adds punches (forces
+of 0.08 s), arms that follow random targets, and uneven ground. Prints one table: each bar,
 its required value, the worst measured value, and the condition of that value. The exit code is 0
 even if the policy misses a bar. docs/sim2sim.md describes the measurements.
 
@@ -37,13 +37,13 @@ from kslc_jax.config import ConfigError, RandomizeConfig, require_seed
 from kslc_jax.evaluation import bars as bars_lib
 from kslc_jax.evaluation import options, tables
 from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
-from kslc_jax.evaluation.perturbations import ALL, changes, settings
+from kslc_jax.evaluation.perturbations import ALL, changes, left_out, settings
 
 if TYPE_CHECKING:
     from kslc_jax.robot import Robot
 
 SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
-"""Commanded speeds [m/s]. No bar uses the last one; it is only reported."""
+"""Commanded speeds [m/s]. No bar uses the last one; only --json has its numbers."""
 
 HEADINGS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 """Starting headings [rad] of the schedule. At pi the measured yaw jumps between pi and -pi."""
@@ -123,7 +123,7 @@ class Args:
     seconds: float | None = None
     """Length of the trials at constant speeds [s]; None: 60, with --quick 15."""
     harsh: bool = False
-    """Also try the policy under shoves of 300 N, with arms that follow random targets, and on
+    """Also try the policy under punches of 300 N, with arms that follow random targets, and on
     uneven ground."""
     drake: bool = False
     """Also try the policy in Drake. This is slow, and needs the package drake."""
@@ -379,6 +379,8 @@ def _report(args: Args, path: Path) -> None:
             keep(found)
 
     screen = tables.console()
+    if missing := left_out(args.size.perturbations, size.perturbations):
+        screen.print(missing)
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in PARTS}
         for name in ("harsh", "drake"):

@@ -20,6 +20,12 @@ def quat_rotate_inverse(q: jax.Array, v: jax.Array) -> jax.Array:
     return quat_rotate(q * jnp.array([1.0, -1.0, -1.0, -1.0]), v)
 
 
+def quat_multiply(a: jax.Array, b: jax.Array) -> jax.Array:
+    """The rotation b, then a. All are quaternions [4], w first."""
+    vector = a[0] * b[1:] + b[0] * a[1:] + jnp.cross(a[1:], b[1:])
+    return jnp.concatenate([(a[0] * b[0] - a[1:] @ b[1:])[None], vector])
+
+
 def quat_to_euler(q: jax.Array) -> jax.Array:
     """Roll, pitch, yaw [3, rad] of `q` [4], about the fixed axes x, y, z.
 

@@ -20,8 +20,9 @@ SERVO_DAMPING = 2
 THETA = 0.6
 """theta of the theta-method: weight of the motor torque at the end of a physics step.
 
-The torque at its start has the weight 1 - theta. theta = 1 is backward Euler: at 5 ms it slows
-motions that 1 ms leaves free. Below 0.5 the method is unstable (docs/fidelity_physics.md)."""
+The torque at its start has the weight 1 - theta. theta = 1 is backward Euler: at 5 ms it damps
+motions that steps of 1 ms do not damp. Below 0.5 the method is unstable
+(docs/fidelity_physics.md)."""
 
 LEAST_CHANGE = 0.01
 """Smallest change of joint speed [rad/s] over which `motor_damping` measures the slope."""

@@ -124,8 +124,8 @@ def _planes(config: PhysicsConfig, state: PhysicsState, ground: Ground) -> Plane
     """The planes that touch the ground where the sole spheres will be.
 
     The spheres' positions are expected from their position and velocity at the start of the control
-    step. An error of theirs hardly counts: a plane that touches the ground a little beside the
-    sphere has the ground's height below it up to second order.
+    step. A small error of the expected position matters little: the plane is tangent to the ground
+    there, so below the sphere its height is wrong by second order only.
     """
     robot = robot_for(config)
     pos, vel = (state.sensordata[robot.soles(what)].reshape(-1, 3) for what in ("pos", "vel"))

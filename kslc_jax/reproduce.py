@@ -171,7 +171,7 @@ def repeat(args: Args) -> list[Row]:
     screen.print(report(rows, f"{args.policy}: evaluation"))
     if args.train:
         if of_an_older_recipe(policy.config):
-            print(f"{args.policy} is of an older recipe than `make train`'s; its own is trained")
+            print(f"{args.policy} is of an older recipe: --train uses it, not today's preset")
         milestones = stored(folder, files.MILESTONES)
         found = retrain(args, policy.config, LATER * max(milestones.values()))
         trained = compare_milestones(milestones, found)

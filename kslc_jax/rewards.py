@@ -73,7 +73,7 @@ def feet_clearance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
     """Eq. 7 as read: sum over the swing feet of exp(-|h - (1 + gain g) target| / width).
 
     h [m] is the swing height. With `clearance_mid_swing` each foot is weighted with
-    2 sin^2(phase). HG's form counts the swing feet with |h - target| < width.
+    2 sin^2(2 pi phase). HG's form counts the swing feet with |h - target| < width.
     """
     swing = ~x.gait.stance
     if not cfg.velocity_rewards:
@@ -120,9 +120,9 @@ def vel_mismatch_exp(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> j
 
 
 def low_speed(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Compares |vx| with the command: -1 below 0.5 times, 0 above 1.2 times, 1.2 between.
+    """Compares vx with the commanded vx, base frame. s is the ratio of their sizes.
 
-    -2 in the wrong direction; 0 for commands up to 0.1 m/s.
+    -1 if s < 0.5, 0 if s > 1.2, else 1.2; -2 if the signs differ. 0 for commands up to 0.1 m/s.
     """
     speed, command = x.signals.base_linvel[0], x.command.velocity[0]
     share = jnp.abs(speed) / jnp.maximum(jnp.abs(command), 1e-6)
@@ -145,9 +145,9 @@ def track_vel_hard(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax
 def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
     """exp(-10 |mean xy velocity error|), times `_exactness` (ours).
 
-    The mean is over about one gait cycle. Within a stride the speed varies by more than the mean
-    error that matters. Each moment's velocity is compared with the command of that moment. A mean
-    velocity would lag behind a new command, and pay a robot to overshoot it.
+    The mean is over about one gait cycle. Within a stride the speed varies more than the errors of
+    the mean speed that this term must detect. Each moment's velocity is compared with the command
+    of that moment. A mean velocity would lag behind a new command, and pay a robot to overshoot it.
     """
     exact = jnp.exp(-10.0 * norm(x.gait.mean_error))
     return exact * _exactness(cfg, x)
@@ -188,9 +188,10 @@ def feet_contact_forces(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -
 
 
 def _spread(cfg: RewardConfig, x: Inputs, points: jax.Array, bounds: tuple[float, float]):
-    """1 while the distance of two points [2, 3] lies within `bounds` [m]; falls fast outside.
+    """1 while the distance of two points [2, 3] lies within `bounds` [m].
 
-    The distance is planar, or with `lateral_distance` across the heading.
+    Outside it is 0.5 + 0.5 exp(-100 d); d [m] is the distance to the nearer bound, at most 0.5.
+    The distance of the points is planar, or with `lateral_distance` across the heading.
     """
     apart = points[0] - points[1]
     lateral = jnp.abs(_heading_frame(x, apart)[1])
@@ -231,9 +232,10 @@ def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> 
 
 
 def orientation(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Two kernels of the torso's tilt: 1 at the target, upright by default.
+    """Mean of exp(-10 (|roll| + |pitch - lean|)) and exp(-20 |g_xy - (sin lean, 0)|).
 
-    The target leans forward by `lean_per_speed` times the commanded |vx|.
+    lean [rad] is `lean_per_speed` times the commanded |vx|. g is the unit vector of gravity in the
+    base frame.
     """
     lean = cfg.lean_per_speed * jnp.abs(x.command.velocity[0])
     roll, pitch = x.signals.base_euler[0], x.signals.base_euler[1] - lean
@@ -243,7 +245,10 @@ def orientation(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
 
 def base_acc(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """exp(-3 |change of the base's 6-D velocity over one control step|)."""
+    """exp(-3 |dv|). dv [6] is the change of the base's velocity over one control step.
+
+    Its linear part is in m/s, its angular part in rad/s, both in the world frame.
+    """
     return jnp.exp(-3.0 * norm(x.signals.base_velocity - x.last_base_velocity))
 
 
@@ -253,14 +258,15 @@ def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """Joint motion, distance from the default pose, action changes and motion of the feet while
-    standing (ours).
+    """|q| + 0.1 |dq| + e (restless |da|^2 + shuffle (1 - exp(-|v|^2 / shuffle_speed^2))) (ours).
 
-    It is 0 while the command is to move. Action changes enter squared: exploration noise then adds
-    on average the same amount for every mean action, and does not hide that the mean itself
-    trembles. Moving feet cost, because a robot that shuffles them creeps. The noise is large in
-    early training and would dominate the term. So these two grow with the commanded range, see
-    `_exactness`.
+    q [rad] are the joint angles, dq [rad/s] their speeds, da the change of the action, v [m/s] the
+    velocities of both feet, and e is `_exactness`. The term is 0 while the command is to move.
+
+    Action changes are squared. Exploration noise then adds a constant on average, so changes of the
+    mean action still count. Moving feet cost, because a robot that shuffles them creeps. The noise
+    is large in early training and would dominate the term. So these two grow with the range of
+    commands.
 
     The cost of the feet has a bound. Without one, the total of a robot that steps is below zero.
     With `only_positive` it is then 0 whatever the robot does, so the robot cannot learn to stand.

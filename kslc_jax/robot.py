@@ -76,6 +76,14 @@ class Robot:
         home = self.default_qpos[7:]
         return self.joint_lower - home, self.joint_upper - home
 
+    @property
+    def foot_shapes(self) -> tuple[np.ndarray, ...]:
+        """Geoms of the left and of the right foot that collide; at high fidelity its own shapes."""
+        model = self.mj_model
+        colliding = (model.geom_contype | model.geom_conaffinity) > 0
+        left, right = self.anatomy.feet
+        return tuple(np.flatnonzero(colliding & (model.geom_bodyid == f)) for f in (left, right))
+
     def roll_and_yaw(self, side: str) -> list[int]:
         """Joints of the hip of one side that turn about x and z; a leg may lack one."""
         names = f"{side}_hip_roll", f"{side}_hip_yaw"

@@ -37,7 +37,10 @@ CUDA_FIX = "pip install 'kslc_jax[cuda]'"
 NVIDIA = Path("/dev/nvidia0")
 """A file that exists if the driver of an NVIDIA GPU is loaded."""
 
-NUMERICS: dict[str, str | bool | float | None] = {
+Value = str | bool | float | None
+"""Value of an option of JAX."""
+
+NUMERICS: dict[str, Value] = {
     "jax_enable_x64": False,
     "jax_default_matmul_precision": None,
     "jax_default_prng_impl": "threefry2x32",
@@ -48,11 +51,26 @@ NUMERICS: dict[str, str | bool | float | None] = {
     "jax_disable_jit": False,
     "jax_debug_nans": False,
     "jax_debug_infs": False,
+    "jax_error_checking_behavior_nan": "ignore",
+    "jax_error_checking_behavior_divide": "ignore",
+    "jax_error_checking_behavior_oob": "ignore",
+    "jax_debug_key_reuse": False,
+    "jax_check_tracer_leaks": False,
+    "jax_no_tracing": False,
+    "jax_no_execution": False,
+    "jax_thread_guard": False,
+    "jax_transfer_guard": None,
+    "jax_transfer_guard_host_to_device": None,
+    "jax_transfer_guard_device_to_host": None,
+    "jax_transfer_guard_device_to_device": None,
     "jax_optimization_level": "UNKNOWN",
+    "jax_disable_most_optimizations": False,
     "jax_exec_time_optimization_effort": 0.0,
+    "jax_memory_fitting_effort": 0.0,
+    "jax_memory_fitting_level": "O2",
 }
-"""Options of JAX that change numbers, or that stop at a NaN although this package masks it. All
-commands use these values, which are JAX's defaults."""
+"""Options of JAX that change numbers, or that raise errors in sound programs, say at a NaN that
+this package masks. All commands use these values, which are JAX's defaults."""
 
 _YES, _NO = ("1", "true", "t", "yes", "y", "on"), ("0", "false", "f", "no", "n", "off")
 
@@ -101,40 +119,51 @@ def fix_numerics() -> list[str]:
         if text and not _means(text, ours):
             found[name.upper()] = text
         if jax := sys.modules.get("jax"):
-            options = jax.config
-            value = getattr(options, name, ours)  # a JAX version may lack an option
+            value = _option(jax.config, name, ours)  # a JAX version may lack an option
             if value != ours:
                 found.setdefault(name.upper(), str(value))
-                options.update(name, ours)
+                jax.config.update(name, ours)
     return [f"{name}={value}" for name, value in found.items()]
+
+
+def _option(options: Any, name: str, default: Value) -> Value:
+    """The present value of an option in `jax.config`; `default` if this JAX lacks it."""
+    return getattr(options, name, options.values.get(name, default))
 
 
 @contextlib.contextmanager
 def own_numerics() -> Generator[None]:
-    """At its end the options of `NUMERICS` in JAX are what they were, if JAX was imported before.
+    """At its end the options of `NUMERICS` in JAX and in the environment are what they were.
 
     A command may run in a notebook whose user has chosen, say, 64-bit numbers.
     """
-    options = getattr(sys.modules.get("jax"), "config", None)
-    before = {name: getattr(options, name) for name in NUMERICS if hasattr(options, name)}
+    texts = {name: text for name in NUMERICS if (text := os.environ.get(name.upper()))}
+    jax = sys.modules.get("jax")
+    before = {name: _option(jax.config, name, x) for name, x in NUMERICS.items()} if jax else {}
     try:
         yield
     finally:
-        if options is not None:
-            for name, value in before.items():
-                options.update(name, value)
+        os.environ.update({name.upper(): text for name, text in texts.items()})
+        if not jax and (jax := sys.modules.get("jax")):  # the command imported it
+            before = {name: _read_as(text, NUMERICS[name]) for name, text in texts.items()}
+        for name, value in before.items():
+            if jax and name in jax.config.values:
+                jax.config.update(name, value)
 
 
-def _means(text: str, value: str | bool | float | None) -> bool:
+def _means(text: str, value: Value) -> bool:
     """True if JAX reads `text` in the environment as `value`."""
-    if isinstance(value, bool):
-        return text.lower() in (_YES if value else _NO)
-    if isinstance(value, float):
-        try:
-            return float(text) == value
-        except ValueError:
-            return False
-    return text == str(value)
+    return _read_as(text, value) == value
+
+
+def _read_as(text: str, like: Value) -> Value:
+    """What JAX reads from `text` in the environment, for an option whose default is `like`."""
+    if isinstance(like, bool):
+        return text.lower() in _YES if text.lower() in _YES + _NO else not like
+    if isinstance(like, int | float):
+        with contextlib.suppress(ValueError):
+            return type(like)(text)
+    return text
 
 
 def affine_cpus() -> int:
@@ -200,17 +229,47 @@ def choose_gl() -> None:
             return
 
 
+LOG_LEVELS = {
+    # Orbax raises its errors. It also prints pages of tracebacks of its threads.
+    "absl": logging.CRITICAL,
+    "asyncio": logging.CRITICAL,
+    # Drake warns about deformable bodies at every half space, though there are none.
+    "drake": logging.ERROR,
+}
+"""Levels of other libraries' loggers in a command."""
+
+
+def is_program() -> bool:
+    """True if this process runs a command of this package only, as python -m kslc_jax.train does.
+
+    False in a notebook, or in a program that calls the command.
+    """
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    return spec is not None and spec.name.partition(".")[0] in ("kslc_jax", "benchmarks")
+
+
+@contextlib.contextmanager
+def own_hooks() -> Generator[None]:
+    """At its end everything that `quiet` changes is what it was."""
+    hooks, show = (sys.excepthook, sys.unraisablehook), warnings.formatwarning
+    levels = {name: logging.getLogger(name).level for name in LOG_LEVELS}
+    try:
+        yield
+    finally:
+        sys.excepthook, sys.unraisablehook = hooks
+        warnings.formatwarning = show
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
+
+
 def quiet() -> None:
     """Silences error reports of libraries, and prints Python warnings and Ctrl-C in one line.
 
     This package reports these errors itself. The function changes the whole process, so only
     commands call it.
     """
-    # Orbax raises its errors. It also prints pages of tracebacks of its threads.
-    for name in ("absl", "asyncio"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    # Drake warns about deformable bodies at every half space, though there are none.
-    logging.getLogger("drake").setLevel(logging.ERROR)
+    for name, level in LOG_LEVELS.items():
+        logging.getLogger(name).setLevel(level)
     sys.excepthook, sys.unraisablehook = _excepthook, _unraisablehook
     warnings.formatwarning = _one_line  # ty: ignore[invalid-assignment]
 

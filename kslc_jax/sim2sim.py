@@ -47,6 +47,7 @@ from kslc_jax.evaluation.perturbations import (
     ALL,
     changes,
     disturbed,
+    left_out,
     settings,
     terrain,
 )
@@ -256,6 +257,7 @@ def _report(args: Args) -> None:
     policy = load_policy(args.policy)
     engine = trials.engine(policy, "high")
     robot = physics.robot_for(engine)
+    wanted = ALL if "all" in args.perturb else ()
     args = dataclasses.replace(args, perturb=named(args, robot))
     options.require_engine(args.engine, robot)  # what is impossible fails before any trial
     for condition in args.conditions:
@@ -263,6 +265,8 @@ def _report(args: Args) -> None:
     for name in args.schedule:
         schedules.named(name, policy.config, float(policy.curriculum.v_max), args.top)
     screen = tables.console()
+    if missing := left_out(wanted, args.perturb):
+        screen.print(missing)
     # One report per simulated second: the estimate of the remaining time needs a long window.
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in args.conditions}

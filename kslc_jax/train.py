@@ -1,9 +1,9 @@
 """Train a robot to walk and run: python -m kslc_jax.train [--preset NAME] [--any.nested.field V]
 
 The config is a preset, and options override its fields. The run folder gets the config, versions,
-metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and exits; --resume continues bit for
-bit. The defaults below are those of the laptop preset. Name another --preset before --help to see
-its defaults.
+metrics (JSONL and TensorBoard) and checkpoints. Ctrl-C saves and exits; --resume continues, on a
+CPU bit for bit. The defaults below are those of the laptop preset. Name another --preset before
+--help to see its defaults.
 
 Examples:
   python -m kslc_jax.train                          # the laptop preset, on a GPU if there is one
@@ -86,7 +86,7 @@ class Args:
     processes: int | None = None
     """Number of processes, with --coordinator host:port."""
     process_index: int | None = None
-    """Index of this process, from 0. Only process 0 reads, writes and prints."""
+    """Index of this process, from 0. Process 0 writes the run folder and shows progress."""
     config: Annotated[Config, tyro.conf.arg(name="")] = config_lib.PRESETS[DEFAULT]
     """All other numbers of the training. The preset gives the defaults."""
 
@@ -121,7 +121,8 @@ def cluster(
             "or --coordinator auto alone"
         )
     if not counts[1] < counts[0]:
-        raise ConfigError(f"--process-index: {counts[1]} of {counts[0]} processes, from 0")
+        last = counts[0] - 1
+        raise ConfigError(f"--process-index: {counts[1]} is too large, it counts from 0 to {last}")
     return coordinator, counts[0], counts[1]
 
 
@@ -202,7 +203,7 @@ def _seeds_there(args: Args, run_dir: Path) -> int:
 def _require_alone(args: Args) -> None:
     """ConfigError if an option cannot be combined with --seeds."""
     if args.seeds < 1 or args.config.seed + args.seeds > COUNTER:
-        raise ConfigError(f"--seeds: {args.seeds} seeds from {args.config.seed}, 1 to 2^31 in all")
+        raise ConfigError("--seeds must be at least 1, and --seed + --seeds at most 2^31")
     excluded = {
         "--start-from": args.start_from is not None,
         "--profile": args.profile > 0,

@@ -1,7 +1,7 @@
 """Rollout -> GAE -> PPO update -> curriculum: ONE pure function of ONE state.
 
-`TrainState` is the whole state of a training. A training that resumes from a saved `TrainState` is
-equal, bit for bit, to one that never stopped.
+`TrainState` is the whole state of a training. On a CPU a training that resumes from a saved
+`TrainState` is equal, bit for bit, to one that never stopped.
 """
 
 import dataclasses
@@ -235,9 +235,10 @@ def metrics_of(
 ) -> Metrics:
     """Scalars of one train step.
 
-    `reward/...` are unweighted terms. `broken` is the share of masked samples. `no_reward` is the
-    share of samples that earn nothing: their costs are larger than the rest (`only_positive`).
-    `finite` is 1 if all numbers of the learner and the curriculum are finite, else 0.
+    `reward/...` are unweighted terms. These are shares of the samples: `broken`, masked because of
+    bad physics; `no_reward`, of the others those with a reward of 0 or less; `falls`, an episode
+    ends by a fall or by bad physics; `speeding`, a joint is at or above its speed limit. `finite`
+    is 1 if all numbers of the learner and the curriculum are finite, else 0.
     """
     terms = {f"reward/{name}": jnp.mean(value) for name, value in out.terms.items()}
     return {

@@ -1,6 +1,7 @@
 """Hand-made states: one robot that stands upright at rest, with named changes."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -13,6 +14,9 @@ from kslc_jax.config import Config
 from kslc_jax.gait import GaitState
 from kslc_jax.policy import Policy
 from kslc_jax.signals import Signals
+
+BIPED = str(Path(__file__).parent / "data" / "biped.toml")
+"""A small biped that differs from XBot-L in all that code may take for granted."""
 
 XBOT = robot.load()
 ACTOR, CRITIC = observations.actor_table(XBOT), observations.critic_table(XBOT)

@@ -1,5 +1,6 @@
 """The package with another robot: the biped of tests/data, without arms and with other names."""
 
+import copy
 import dataclasses
 import json
 import runpy
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from states import XBOT, random_params
+from states import BIPED, XBOT, random_params
 
 from kslc_jax import (
     checkpoint_format,
@@ -48,7 +49,6 @@ from kslc_jax.robots.description import RobotError
 from kslc_jax.training import run_folder, same_training, starting
 from kslc_jax.training.checkpoint_process import LocalStorage
 
-BIPED = str(Path(__file__).parent / "data" / "biped.toml")
 ENVS = 3
 
 
@@ -480,7 +480,7 @@ def test_legs_may_have_neither_roll_nor_yaw(biped, setup):
 
 
 def test_a_robot_is_tried_under_what_it_can_have():
-    """The biped has no arms, and its feet are no boxes of known names."""
+    """The biped has no arms. A foot that is a capsule cannot have another sole."""
     physics_config = config.HighFidelity(robot=BIPED)
     high = physics.robot_for(physics_config)
     plain = trials.Setting(physics_config)
@@ -491,32 +491,64 @@ def test_a_robot_is_tried_under_what_it_can_have():
 
     possible = variation.for_robot(perturbations.ALL, high)
     assert [c.split("=")[0] for c in perturbations.ALL if c.split("=")[0] in ("hands", "sole")]
-    assert len(possible) == 14 and not {"hands", "sole"} & {c.split("=")[0] for c in possible}
+    assert len(possible) == 15 and "hands" not in {c.split("=")[0] for c in possible}
     assert "payload=5" not in possible  # a payload of its size
     for condition in possible:
         trials.require(setting(condition), high)
-    for condition in ("hands=0.5", "sole=0.01"):
-        with pytest.raises(config.ConfigError, match="leave it out"):
-            trials.require(setting(condition), high)
+    with pytest.raises(config.ConfigError, match="leave it out"):
+        trials.require(setting("hands=0.5"), high)
+    model = copy.copy(high.mj_model)
+    model.geom_type[high.foot_shapes[1]] = mujoco.mjtGeom.mjGEOM_CAPSULE
+    round_foot = dataclasses.replace(high, mj_model=model)
+    assert len(variation.for_robot(perturbations.ALL, round_foot)) == 14
+    with pytest.raises(config.ConfigError, match="a foot of biped is not one box"):
+        trials.require(setting("sole=0.01"), round_foot)
     held = dataclasses.replace(plain.randomize, held_arms=1.0)
     with pytest.raises(config.ConfigError, match="has no arms"):
         trials.require(dataclasses.replace(plain, randomize=held), high)
 
 
-def test_drake_refuses_a_robot_that_it_cannot_take_over():
-    drake = pytest.importorskip("kslc_jax.evaluation.drake")
-    drake.require_plain(robot.load("high"))
-    with pytest.raises(config.ConfigError, match="--engine mujoco"):
-        drake.require_plain(robot.load("high", name=BIPED))
+def test_the_soles_of_a_turned_foot_wander_inside_it():
+    """The biped's right foot is turned by half a turn. It keeps within the sole's outline."""
+    high = robot.load("high", name=BIPED)
+    nominal = randomize.model_fields(high, randomize.nominal(high), 1.0)
+    plain, left_right = high.mj_model, [int(foot[0]) for foot in high.foot_shapes]
+
+    def corners(model):
+        data = mujoco.MjData(model)
+        data.qpos[:] = high.default_qpos
+        mujoco.mj_kinematics(model, data)
+        signs = np.array([[x, y, -1] for x in (-1, 1) for y in (-1, 1)])
+        return np.stack(
+            [
+                data.geom_xpos[foot]
+                + (signs * model.geom_size[foot]) @ data.geom_xmat[foot].reshape(3, 3).T
+                for foot in left_right
+            ]
+        )
+
+    outline = corners(plain)
+    for seed in range(5):
+        fields = variation._soles(0.02, high, jax.random.key(seed), nominal)
+        model = copy.copy(plain)
+        for name, value in fields.items():
+            getattr(model, name)[:] = np.asarray(value)
+        sole = corners(model)
+        for foot in range(2):
+            lower, upper = outline[foot].min(axis=0), outline[foot].max(axis=0)
+            inside = (sole[foot] >= lower - 1e-3) & (sole[foot] <= upper + 1e-3)
+            assert inside.all()
+            moved = np.abs(sole[foot] - outline[foot])[:, :2]
+            assert 1e-3 < moved.max() <= 0.02 + 1e-3
 
 
-@pytest.mark.slow(reason="compiles a trial for each of fifteen conditions: minutes")
+@pytest.mark.slow(reason="compiles a trial for each of sixteen conditions: minutes")
 def test_the_biped_is_tried_in_full_mujoco(untrained, tmp_path, capsys):
     policy.save_policy(untrained, tmp_path / "policy")
     out = tmp_path / "out.json"
     short = ["--perturb", "all", "--speeds", "0.3", "--seeds", "1", "--seconds", "3"]
     assert sim2sim.main([str(tmp_path / "policy"), *short, "--json", str(out)]) == 0
-    assert len(records.read_conditions(out)) == 15
+    assert len(records.read_conditions(out)) == 16
 
 
 def test_a_robot_is_chosen_by_its_own_option(capsys):

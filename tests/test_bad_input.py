@@ -132,8 +132,8 @@ class TestTrain:
     def test_profile_and_devices(self, run_dir):
         assert "--profile: -1" in self.refused(run_dir, "--profile", -1)
         assert "--profile" in self.refused(run_dir, "--profile", "few")
-        assert "--devices: 0 of" in self.refused(run_dir, "--devices", 0)
-        assert "--devices: 99 of" in self.refused(run_dir, "--devices", 99)
+        assert "--devices: 0 asked for" in self.refused(run_dir, "--devices", 0)
+        assert "--devices: 99 asked for" in self.refused(run_dir, "--devices", 99)
         assert "--devices" in self.refused(run_dir, "--devices", "few")
 
     @pytest.mark.parametrize(
@@ -156,7 +156,9 @@ class TestTrain:
     def test_processes_that_cannot_be(self, run_dir):
         where = ("--coordinator", "localhost:1234", "--processes", 2, "--process-index", 2)
         assert "--process-index: 2 of 2" in self.refused(run_dir, *where)
-        assert "--coordinator: cannot join" in self.refused(run_dir, "--coordinator", "auto")
+        assert "--coordinator auto, with the scheduler's settings: cannot join" in self.refused(
+            run_dir, "--coordinator", "auto"
+        )
 
     def test_impossible_folder(self, tmp_path):
         folder = tmp_path / ("x" * 300)

@@ -321,6 +321,55 @@ def test_gpu_question_of_exactness(plan, monkeypatch):
         assert found[title]["two processes"] and found[title]["resume in two processes"] == exact
 
 
+@pytest.mark.parametrize(("installed", "seconds"), [(True, 10.0), (False, 100.0)])
+def test_gpu_trainings_leave_time_to_brax(installed, seconds, plan, monkeypatch):
+    asked = {}
+
+    def child(module, argv, env, timeout):
+        asked.update(zip(argv[::2], argv[1::2], strict=True))
+        return {"machine": {}}
+
+    monkeypatch.setattr(timing, "child", child)
+    monkeypatch.setattr(gpu_all, "_installed", lambda package: installed)
+    gpu_all.run(dataclasses.replace(plan, parts=("large",), train=True))
+    assert float(asked["--train-seconds"]) == pytest.approx(100.0, abs=1.0)
+    gpu_all.run(dataclasses.replace(plan, parts=("brax", "large"), train=True))
+    assert float(asked["--train-seconds"]) == pytest.approx(seconds, abs=1.0)
+
+
+def test_gpu_trainings_share_the_time(monkeypatch):
+    """The time that a quick training leaves over goes to those after it."""
+    now, given = [0.0], []
+
+    def until(speed, state, program, seconds):
+        given.append(seconds)
+        now[0] += min(seconds, 10.0)
+        return (10.0, 3) if seconds >= 10.0 else None
+
+    def measured(programs, repeats):
+        now[0] += 40.0  # with compiling
+        return dict.fromkeys(programs, 0.5)
+
+    monkeypatch.setattr(gpu_parts.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(gpu_parts, "compiled", lambda make, threads: (None, None, {}))
+    monkeypatch.setattr(gpu_parts, "in_turn", measured)
+    monkeypatch.setattr(gpu_parts, "until", until)
+    monkeypatch.setattr("kslc_jax.train_step.make", lambda config: (lambda: None, None))
+    numbers = gpu_parts.large(gpu_parts.Args("large", train_seconds=100.0))
+    assert given == [30.0, 50.0] and len(numbers) == 4
+    assert set(numbers.values()) == {2 * 49152 / 0.5, 4 * 49152 / 0.5, (10.0, 3)}
+
+
+def test_gpu_training_until_a_speed():
+    speeds = iter([0.5, 3.0, 3.5, 4.0])
+
+    def program(state):
+        return state + 1, {"curriculum/v_max": next(speeds), "step": state + 1}
+
+    assert gpu_parts.until(3.5, 0, program, 100.0)[1] == 3
+    assert gpu_parts.until(3.5, 0, program, 0.0) is None
+
+
 def test_larger_batches():
     sizes = {
         name: (config.env.num_envs, config.ppo.minibatches)

@@ -6,6 +6,8 @@ import math
 import os
 import subprocess
 import sys
+import warnings
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -44,8 +46,9 @@ def test_any_other_error_keeps_its_traceback():
         cli.run(failing(ZeroDivisionError()))
 
 
-def test_ctrl_c_is_one_line_and_ends_a_script_or_cell(process, capsys):
+def test_ctrl_c_is_one_line_and_ends_a_script_or_cell(process, capsys, monkeypatch):
     """Python then ends by the signal, so that a shell's loop over commands ends, too."""
+    monkeypatch.setattr(runtime, "is_program", lambda: True)
     with pytest.raises(KeyboardInterrupt):
         cli.run(failing(KeyboardInterrupt()))
     sys.excepthook(KeyboardInterrupt, KeyboardInterrupt(), None)
@@ -62,6 +65,7 @@ def process(monkeypatch):
     """A process whose hooks and log levels are Python's own."""
     monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
     monkeypatch.setattr(sys, "unraisablehook", sys.__unraisablehook__)
+    monkeypatch.setattr(warnings, "formatwarning", lambda *args: "")
     levels = {name: logging.getLogger(name).level for name in ("absl", "asyncio")}
     for name in levels:
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -72,7 +76,7 @@ def process(monkeypatch):
 
 def hooks():
     levels = [logging.getLogger(name).level for name in ("absl", "asyncio")]
-    return sys.excepthook, sys.unraisablehook, levels
+    return sys.excepthook, sys.unraisablehook, warnings.formatwarning, levels
 
 
 def test_preparing_leaves_hooks_and_logs_alone(process):
@@ -127,10 +131,35 @@ def test_other_errors_that_nobody_can_catch_are_shown(process, capsys):
     assert "ValueError: so" in capsys.readouterr().err
 
 
-def test_a_command_silences_its_process(process):
+def test_a_command_silences_its_process(process, monkeypatch):
+    """A notebook's process only while the command runs."""
+    before, inside = hooks(), []
+    assert not runtime.is_program()
+    cli.run(lambda: inside.append(hooks()))
+    assert hooks() == before and all(a != b for a, b in zip(inside[0], before, strict=True))
+    monkeypatch.setattr(runtime, "is_program", lambda: True)
     cli.run(lambda: None)
-    assert sys.excepthook is not sys.__excepthook__
-    assert logging.getLogger("absl").level == logging.CRITICAL
+    assert hooks() == inside[0]
+
+
+IS_PROGRAM = """
+import sys
+from kslc_jax import doctor, runtime
+sys.exit(not runtime.is_program())
+"""
+
+
+@pytest.mark.parametrize("how", ["module", "code"])
+def test_a_program_is_a_command_of_this_package(how, tmp_path):
+    if how == "module":
+        folder = tmp_path / "benchmarks"
+        folder.mkdir()
+        (folder / "one.py").write_text(IS_PROGRAM)
+        words = ["-m", "benchmarks.one"]
+    else:
+        words = ["-c", IS_PROGRAM]
+    done = subprocess.run([sys.executable, *words], cwd=tmp_path, check=False)
+    assert done.returncode == (0 if how == "module" else 1)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +186,10 @@ NUMERICS = {
     "JAX_THREEFRY_PARTITIONABLE": "0",
     "JAX_RANDOM_SEED_OFFSET": "3",
     "JAX_OPTIMIZATION_LEVEL": "O0",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     "JAX_EXEC_TIME_OPTIMIZATION_EFFORT": "-0.5",
+    "JAX_TRANSFER_GUARD": "disallow",
+    "JAX_DEBUG_KEY_REUSE": "1",
 }
 
 
@@ -221,15 +253,22 @@ def test_variables_that_change_nothing_are_no_word(monkeypatch, capsys):
 
 def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
     """A notebook may have set them before it calls a command."""
-    before = {name: getattr(jax.config, name, x) for name, x in runtime.NUMERICS.items()}
+
+    def options():
+        return {n: runtime._option(jax.config, n, x) for n, x in runtime.NUMERICS.items()}
+
+    before = options()
     assert before == runtime.NUMERICS  # JAX's defaults, with the oldest JAX and the newest
     try:
         jax.config.update("jax_enable_x64", True)
         jax.config.update("jax_default_matmul_precision", "bfloat16")
+        jax.config.update("jax_disable_most_optimizations", True)
+        jax.config.update("jax_transfer_guard", "disallow")
         runtime.prepare(gl=False)
         said = capsys.readouterr().err
         assert "JAX_ENABLE_X64=True" in said and "MATMUL_PRECISION=bfloat16" in said
-        assert before == {name: getattr(jax.config, name, x) for name, x in before.items()}
+        assert "DISABLE_MOST_OPTIMIZATIONS=True" in said and "TRANSFER_GUARD=disallow" in said
+        assert options() == before
         jax.config.update("jax_enable_x64", True)
         inside = []
         assert cli.run(lambda: inside.append(jax.config.jax_enable_x64)) == 0
@@ -237,6 +276,30 @@ def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
     finally:
         for name, value in before.items():
             jax.config.update(name, value)
+
+
+def test_variables_of_a_notebook_count_again_after_a_command():
+    """Also if the command is the first that imports JAX."""
+    code = (
+        "import os; from kslc_jax import cli\n"
+        "inside = []\n"
+        "def do():\n"
+        "    import jax, jax.numpy as jnp\n"
+        "    inside.append((jnp.ones(1).dtype.name, os.environ.get('JAX_ENABLE_X64')))\n"
+        "cli.run(do)\n"
+        "import jax.numpy as jnp\n"
+        "print(inside, jnp.ones(1).dtype.name, os.environ['JAX_ENABLE_X64'])"
+    )
+    env = {**os.environ, "JAX_ENABLE_X64": "1"}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, env=env, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[('float32', None)] float64 1"
+
+
+def test_every_option_of_jax_is_known():
+    """A new one may change numbers: then it belongs in `runtime.NUMERICS`, else in the file."""
+    known = (Path(__file__).parent / "data" / "jax_options.txt").read_text().split()
+    assert {*jax.config.values} - {*known, *runtime.NUMERICS} == set()
 
 
 def cgroup(root, groups: str, **files: str) -> None:

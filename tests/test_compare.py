@@ -124,7 +124,7 @@ def test_a_run_of_another_config_is_named_and_left_alone(tmp_path, called, capsy
     out = capsys.readouterr()
     first, last = out.err.splitlines()
     assert first.startswith(f"error: {folder} is not of this comparison: ")
-    assert last == "error: left alone: kslc-seed0; name another --out"
+    assert last == "error: another training is in kslc-seed0 and was kept; name another --out"
     assert out.out == "" and list((tmp_path / "kept").iterdir()) == []
     assert (folder / files.EVALUATION).exists()
 

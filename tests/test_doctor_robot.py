@@ -123,7 +123,7 @@ CASES = {
         '"rudder" = { kp = 12 }\n',
         (),
         "motors: kp",
-        "the ankles have 0.34 of the stiffness that stands by itself",
+        "the ankles' stiffness is 0.34 m g h",
     ),
     "effort": (
         '"lock" = { effort = 11 }\n',

@@ -70,6 +70,14 @@ def test_rotation_by_hand(quat, vector, expected):
     )
 
 
+def test_a_product_is_one_rotation_after_another():
+    about_x, about_z = jnp.array([HALF, HALF, 0, 0]), jnp.array([HALF, 0, 0, HALF])
+    both = maths.quat_multiply(about_z, about_x)  # x to y, y to z, z to x
+    np.testing.assert_allclose(both, [0.5, 0.5, 0.5, 0.5], atol=1e-6)
+    for before, after in ((X, Y), (Y, Z), (Z, X)):
+        np.testing.assert_allclose(rotate(both, jnp.asarray(before)), after, atol=1e-6)
+
+
 @quick
 @given(angles, pitches, angles, vectors)
 def test_rotation_is_the_matrix(roll, pitch, yaw, vector):

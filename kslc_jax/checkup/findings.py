@@ -11,11 +11,12 @@ from kslc_jax.config import Config
 from kslc_jax.robot import Robot
 
 SAG = 0.15
-"""Largest angle [rad] by which standing may bend a hip or a knee; XBot-L's knees: 0.105. A quarter
-of a radian is too much: H1's knees with unitree_rl_gym's gains, which do not carry it."""
+"""Largest angle [rad] by which standing may bend a hip or a knee; XBot-L's knees: 0.105. An H1 with
+unitree_rl_gym's gains sinks by 0.25 rad in its knees; that is too much."""
 
 ANKLES = 0.3
-"""Largest stiffness of the ankles as a share of that which stands by itself. XBot-L, 0.08, and a G1
+"""Largest stiffness of both ankles together, as a share of m g h: the weight times the height of
+the centre of mass. With a share of 1 a rigid robot stands without control. XBot-L, 0.08, and a G1
 with 0.14 learnt to walk; a G1 with 0.37, and with straighter knees, learnt to stand."""
 
 SCALE = (0.03, 1.5)
@@ -92,8 +93,9 @@ def stiff_ankles(x: Patient) -> Iterator[Finding]:
     if share > ANKLES:
         yield Finding(
             "motors: kp",
-            f"the ankles have {share:.2f} of the stiffness that stands by itself: it may learn to "
-            f"stand, not to step; soften them (at most {ANKLES:g}; XBot-L: 0.08)",
+            f"the ankles' stiffness is {share:.2f} m g h (at 1 a rigid robot stands without "
+            f"control): it may learn to stand, not to step; soften them (at most {ANKLES:g}; "
+            "XBot-L: 0.08)",
         )
 
 

@@ -192,7 +192,7 @@ def fact_rows(x: Patient) -> list[tuple[str, str]]:
             f"{2 * sole[0]:.3f} m x {2 * sole[1]:.3f} m, {it.sole_drop:.3f} m below the ankle, "
             f"{tilt(it):.1f} degrees from level",
         ),
-        ("ankles", f"{statics.ankle_share(it):.2f} of the stiffness that stands by itself"),
+        ("ankles", f"stiffness {statics.ankle_share(it):.2f} m g h"),
         ("feet, knees apart", f"{it.feet_apart:.3f} m, {it.knees_apart:.3f} m"),
         ("contacts in training", f"{count} pairs of {parts} parts, and the soles"),
         ("observations", f"actor {widths[0]}, critic {widths[1]}"),

@@ -69,8 +69,8 @@ def standing_torque(robot: Robot) -> np.ndarray:
 
 
 def ankle_share(robot: Robot) -> float:
-    """Stiffness of both ankles, as a share of that with which a rigid robot would stand on them:
-    its weight times the height of its centre of mass."""
+    """Stiffness of both ankles together [N m/rad] by m g h, the robot's weight times the height of
+    its centre of mass. With a share of 1 a rigid robot stands on them without control."""
     data = posed(robot, on_the_ground(robot))
     ankles = [robot.anatomy.roles[f"{side}_ankle"] for side in SIDES]
     return float(robot.kp[ankles].sum() / (robot.total_mass * 9.81 * data.sensor("com").data[2]))

@@ -34,9 +34,9 @@ class EnvConfig:
     privileged_frames: int = 3
     """Frames of critic history (paper, Table I)."""
     critic_memory: bool = False
-    """True: the critic's frame also has what decides about the next steps and is not in the paper's
-    frame: the wanted vx and vy that the command approaches, and what reward terms remember, which
-    is the mean velocity error, and the air time and swing height of each foot."""
+    """True: the critic's frame has eight more values than the paper's: the wanted vx and vy, the
+    mean velocity error along x and y, and the air time and swing height of each foot. Rewards of
+    the next steps depend on them."""
     arms: Literal["free", "held"] = "free"
     """free: the policy moves the arms. held: arm actions are ignored and servos keep the arms in
     the home pose (ablation, baseline). The gait's reference must then not move the arms."""
@@ -129,11 +129,11 @@ class GaitConfig:
     cycle_time: float = 0.64
     """Gait cycle [s] at the start of the curriculum (HG)."""
     double_support: float = 0.1
-    """The clock wants both feet on the ground while abs(sin(phase)) is below this (HG)."""
+    """The clock wants both feet on the ground while abs(sin(2 pi phase)) is below this (HG)."""
     double_support_at_speed: float = 0.1
     """Value of `double_support` at `full_speed`. It changes with the square of the speed. Negative
-    values mean flight: the clock wants no foot on the ground while abs(sin(phase)) is below their
-    size."""
+    values mean flight: the clock wants no foot on the ground while abs(sin(2 pi phase)) is below
+    their size."""
     reference_scale: float = 0.17
     """Amplitude of the hip and ankle reference [rad]. The knee's is twice as large (HG)."""
     reference_speed_gain: float = 0.0
@@ -182,9 +182,9 @@ class RandomizeConfig:
     ground_friction: float = 0.6
     """Friction of the ground (HG)."""
     base_mass: Range = (-5.0, 5.0)
-    """Mass added to the base link [kg] (HG)."""
+    """Mass added to the trunk [kg] (HG: to the base link, which is XBot-L's trunk)."""
     base_com: Range = (0.0, 0.0)
-    """Shift of the base link's centre of mass, per axis [m]."""
+    """Shift of the trunk's centre of mass, per axis of its frame [m]."""
     kp: Range = (1.0, 1.0)
     """Factor on the position gains, per joint."""
     kd: Range = (1.0, 1.0)
@@ -217,8 +217,8 @@ class RandomizeConfig:
     """Size [N] of a force that acts for 0.08 s at a random link in a random direction, every 4 s.
     0: no punches."""
     held_arms: float = 0.0
-    """Share of the episodes in which the arms follow slow random targets in place of the actions,
-    as if somebody else moved them."""
+    """Share of the episodes in which the arms follow slow random targets in place of the
+    actions."""
 
     def __post_init__(self):
         for f in dataclasses.fields(self):

@@ -52,11 +52,11 @@ class CurriculumConfig:
     top_falls: float = 1e9
     """Most falls per minute under commands in the top `v_step`. 1e9: no condition."""
     falls_after: float = 0.0
-    """For `top_falls`, falls also count so long [s] after such a command has ended: many robots
-    fall when they brake."""
+    """A fall counts for `top_falls` also within this time [s] after a command at the top has ended:
+    many robots fall when they brake."""
     settle_seconds: float = 0.0
-    """A command is "settled" this long [s] after it changed; only settled commands count for
-    tracking. A robot needs time to reach a new speed, and more in a wider range."""
+    """A command is "settled" from this time [s] after its change on. Only settled commands count
+    for tracking. A robot needs time to reach a new speed, and more in a wider range."""
     smoothing: float = 0.95
     """Share of its old value that a moving average keeps per update."""
     min_updates: int = 40
@@ -88,7 +88,8 @@ class NetworkConfig:
     init_std: float = 1.0
     """Initial standard deviation of the actions (HG)."""
     init_mean: float = 1.0
-    """Size of the untrained actor's outputs. Near 0 the untrained policy holds the default pose."""
+    """Factor on the initial weights of the actor's output layer. Near 0 the untrained policy holds
+    the default pose."""
     symmetric: bool = False
     """True: the networks commute with left-right mirroring. A mirrored robot gets the mirrored
     action and the same value. They need half the work of free networks of the same size."""
@@ -139,8 +140,8 @@ class PPOConfig:
     desired_kl: float = 0.01
     """The learning rate adapts to this KL divergence per minibatch (HG)."""
     average: float = 0.0
-    """The saved policy has a moving average of the acting parameters, which keeps this share per
-    update. 0: the newest parameters."""
+    """Share of its old value that the moving average of the actor's parameters keeps per update.
+    The saved policy has this average. 0: the saved policy has the newest parameters."""
     learning_rate_factor: float = 1.5
     """Factor of one change of the learning rate (HG)."""
 

@@ -77,7 +77,8 @@ class PhysicsConfig:
     decimation: int = 2
     """Physics steps per control step."""
     iterations: int = 4
-    """Newton iterations of the contact solver. With fewer than 4 this robot's contacts explode."""
+    """Newton iterations of the contact solver. With fewer than 4, joints of XBot-L without rotor
+    inertia blow up (docs/fidelity_physics.md)."""
     ls_iterations: int = 5
     """Line-search iterations of the contact solver."""
     threads: int = 0

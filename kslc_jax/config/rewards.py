@@ -58,7 +58,7 @@ class RewardConfig:
     momentum_floor: float = -20.0
     """c1, the lower bound of Eq. 4; c2 is 0."""
     base_height_target: float = 0.89
-    """Target height of the base above the stance feet [m] (HG)."""
+    """Target height of the base above the soles of the stance feet [m] (HG)."""
     base_height_kernel: float = 100.0
     """beta^b of Eq. 6 [1/m]."""
     base_height_drop: float = 0.05
@@ -70,7 +70,7 @@ class RewardConfig:
     clearance_width: float = 0.01
     """Length scale of Eq. 7's kernel, or half width of HG's window [m]."""
     clearance_mid_swing: bool = False
-    """True: weights Eq. 7 with 2 sin^2(phase), whose mean over the swing is 1. The height then
+    """True: weights Eq. 7 with 2 sin^2(2 pi phase), whose mean over the swing is 1. The height then
     counts in mid-swing, not while the foot lifts off or lands."""
     joint_pos_kernel: float = 2.0
     """-beta^p of Eq. 8 [1/rad]."""
@@ -102,7 +102,8 @@ class RewardConfig:
     shuffle: float = 0.0
     """Weight of moving feet within `stand_still`, at full size."""
     shuffle_speed: float = 0.2
-    """Speed of the feet [m/s] at which `shuffle` costs 0.63 of its weight; faster feet cost all."""
+    """Root of the summed squared speeds of both feet [m/s] at which the cost of moving feet is
+    0.63 of `shuffle`. Faster feet cost more, up to `shuffle`."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which `dof_vel_limits` counts."""
 

@@ -16,7 +16,7 @@ import jax
 import mujoco
 import numpy as np
 from pydrake import geometry
-from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.eigen_geometry import AngleAxis, Quaternion
 from pydrake.geometry import GeometryId, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import (
@@ -28,6 +28,7 @@ from pydrake.multibody.plant import (
 from pydrake.multibody.tree import (
     FixedOffsetFrame,
     RevoluteJoint,
+    RevoluteSpring,
     RotationalInertia,
     SpatialInertia,
 )
@@ -38,6 +39,7 @@ from kslc_jax.config import ConfigError, PhysicsConfig
 from kslc_jax.physics import PhysicsState
 from kslc_jax.randomize import Dynamics, model_fields
 from kslc_jax.robot import Robot
+from kslc_jax.robots.shapes import mesh_data
 
 SLAB = 0.1
 """Depth [m] within which the pressure in the floor rises from zero to `MODULUS`."""
@@ -48,8 +50,11 @@ MODULUS = 1e7
 DISSIPATION = 1.0
 """Hunt-Crossley dissipation of the contact [s/m]."""
 
-FEET = ("left_foot", "right_foot")
-"""Geoms whose force on the floor is measured. The sensor of geom NAME is NAME_touch."""
+MESH_SIZE = 0.002
+"""Length [m] of the triangles that stand for a round shape of a foot."""
+
+TOUCH_SENSORS = ("left_foot_touch", "right_foot_touch")
+"""Sensors of the force between each foot and the floor."""
 
 KINEMATICS = (
     mujoco.mj_kinematics,
@@ -73,7 +78,7 @@ class World:
     diagram: Diagram
     plant: MultibodyPlant
     context: Context  # of the diagram
-    feet: tuple[GeometryId, ...]  # left and right
+    feet: tuple[frozenset[GeometryId], ...]  # shapes of the left and of the right foot
     q_index: np.ndarray  # [7 + n] index in Drake's positions of each element of qpos
     v_index: np.ndarray  # [6 + n] index in Drake's velocities of each element of qvel
 
@@ -92,9 +97,9 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     `model` is the robot's model or a changed copy. All shapes have the friction of the feet.
 
     Raises:
-      ConfigError: Drake cannot take over the robot, see `require_plain`.
+      ConfigError: Drake cannot take over the robot, see `require_hinged`.
     """
-    require_plain(robot)
+    require_hinged(robot)
     builder = DiagramBuilder()
     settings = MultibodyPlantConfig(
         time_step=model.opt.timestep,
@@ -104,7 +109,7 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
     )
     plant, scene = AddMultibodyPlant(settings, builder)
     _add_bodies(plant, robot, model)
-    ids = _add_shapes(plant, model, friction=float(model.geom(FEET[0]).friction[0]))
+    ids = _add_shapes(plant, robot, model)
     plant.mutable_gravity_field().set_gravity_vector(model.opt.gravity)
     plant.Finalize()
     _exclude(plant, scene, model)
@@ -118,29 +123,25 @@ def build(robot: Robot, model: mujoco.MjModel) -> World:
         diagram=diagram,
         plant=plant,
         context=diagram.CreateDefaultContext(),
-        feet=tuple(ids[name] for name in FEET),
+        feet=tuple(frozenset(ids[geom] for geom in foot) for foot in robot.foot_shapes),
         # Drake's order: quaternion, position; angular, linear velocity. MuJoCo's is the reverse.
         q_index=np.r_[q + 4 : q + 7, q : q + 4, [j.position_start() for j in joints]],
         v_index=np.r_[v + 3 : v + 6, v : v + 3, [j.velocity_start() for j in joints]],
     )
 
 
-def require_plain(robot: Robot) -> None:
-    """ConfigError if a body has no joint, a frame is turned or shifted, or a foot is missing."""
+def require_hinged(robot: Robot) -> None:
+    """ConfigError if a body does not have exactly one joint."""
     model = robot.mj_model
-    moved = model.body_jntnum[1:] == 0
-    turned = ~np.all(np.isclose(model.body_quat[1:], [1.0, 0.0, 0.0, 0.0]), axis=1)
-    shifted = np.any(model.jnt_pos != 0.0, axis=1)
-    named = all(mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) >= 0 for foot in FEET)
-    if moved.any() or turned.any() or shifted.any() or not named:
+    if wrong := [model.body(i).name for i in range(1, model.nbody) if model.body_jntnum[i] != 1]:
         raise ConfigError(
-            f"engine: drake takes robots with aligned frames and boxes as feet only, as XBot-L is; "
-            f"{robot.name} is not: take --engine mujoco"
+            f"engine: drake takes robots with one joint per body; {wrong[0]!r} of {robot.name} has "
+            f"{model.body(wrong[0]).jntnum[0]}: take --engine mujoco"
         )
 
 
 def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> None:
-    """Adds bodies, hinges and motors, in the robot's joint order.
+    """Adds bodies, hinges, springs and motors, in the robot's joint order.
 
     The joints get the full damping of the servos, and Drake integrates it implicitly. MuJoCo gets
     the part that `motors.motor_damping` gives.
@@ -151,16 +152,30 @@ def _add_bodies(plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel) -> N
         joint = model.joint(name)
         child = model.body(int(joint.bodyid[0]))
         parent = plant.GetBodyByName(model.body(int(child.parentid[0])).name)
+        anchor = RigidTransform(joint.pos)
+        # The frames coincide at angle zero. MuJoCo's angle is `ref` in the pose of the MJCF.
+        turned = RigidTransform(RotationMatrix(AngleAxis(-joint.qpos0[0], joint.axis)), [0, 0, 0])
+        place = _pose(child.pos, child.quat) @ anchor @ turned
         hinge = RevoluteJoint(
             name,
-            plant.AddFrame(FixedOffsetFrame(name, parent, RigidTransform(child.pos))),
-            plant.GetBodyByName(child.name).body_frame(),
+            plant.AddFrame(FixedOffsetFrame(f"{name}_parent", parent, place)),
+            plant.AddFrame(
+                FixedOffsetFrame(f"{name}_child", plant.GetBodyByName(child.name), anchor)
+            ),
             joint.axis,
             damping=joint.damping[0] + servo_damping,
         )
         hinge.set_position_limits(joint.range[:1], joint.range[1:])
-        motor = plant.AddJointActuator(name, plant.AddJoint(hinge))
+        hinge = plant.AddJoint(hinge)
+        if stiffness := float(joint.stiffness[0]):
+            rest = float(joint.qpos_spring[0])
+            plant.AddForceElement(RevoluteSpring(hinge, rest, stiffness))
+        motor = plant.AddJointActuator(name, hinge)
         motor.set_default_rotor_inertia(joint.armature[0])
+
+
+def _pose(pos: np.ndarray, quat: np.ndarray) -> RigidTransform:
+    return RigidTransform(Quaternion(quat), pos)
 
 
 def _inertia(model: mujoco.MjModel, body: int) -> SpatialInertia:
@@ -175,12 +190,16 @@ def _inertia(model: mujoco.MjModel, body: int) -> SpatialInertia:
 
 
 def _add_shapes(
-    plant: MultibodyPlant, model: mujoco.MjModel, friction: float
-) -> dict[str, GeometryId]:
-    """Adds every geom that collides: rigid feet, a compliant floor, point contact for the rest."""
-    ids = {}
-    for i in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
-        geom = model.geom(int(i))
+    plant: MultibodyPlant, robot: Robot, model: mujoco.MjModel
+) -> dict[int, GeometryId]:
+    """Adds every geom that collides: rigid feet, a compliant floor, point contact for the rest.
+
+    Returns the ids of Drake by those of the geoms.
+    """
+    feet, ids = np.concatenate(robot.foot_shapes), {}
+    friction = float(model.geom_friction[feet[0], 0])
+    for i in np.flatnonzero(model.geom_contype | model.geom_conaffinity).tolist():
+        geom = model.geom(i)
         body = plant.GetBodyByName(model.body(int(geom.bodyid[0])).name)
         properties = geometry.ProximityProperties()
         geometry.AddContactMaterial(
@@ -188,22 +207,24 @@ def _add_shapes(
         )
         if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
             geometry.AddCompliantHydroelasticPropertiesForHalfSpace(SLAB, MODULUS, properties)
-        elif geom.name in FEET:
-            geometry.AddRigidHydroelasticProperties(properties)
-        pose = RigidTransform(Quaternion(geom.quat), geom.pos)
-        ids[geom.name] = plant.RegisterCollisionGeometry(
-            body, pose, _shape(geom), geom.name, properties
+        elif i in feet:
+            geometry.AddRigidHydroelasticProperties(MESH_SIZE, properties)
+        name = geom.name or f"geom{i}"
+        ids[i] = plant.RegisterCollisionGeometry(
+            body, _pose(geom.pos, geom.quat), _shape(model, i, name), name, properties
         )
     return ids
 
 
-def _shape(geom) -> geometry.Shape:
-    """Drake's shape for a geom. MuJoCo's sizes are half lengths."""
-    kind = mujoco.mjtGeom(int(geom.type[0]))
-    a, b, c = map(float, geom.size)
+def _shape(model: mujoco.MjModel, geom: int, name: str) -> geometry.Shape:
+    """Drake's shape for a geom. MuJoCo's sizes are half lengths; of a mesh its hull collides."""
+    kind = mujoco.mjtGeom(int(model.geom_type[geom]))
+    a, b, c = map(float, model.geom_size[geom])
     match kind:
         case mujoco.mjtGeom.mjGEOM_PLANE:
             return geometry.HalfSpace()
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return geometry.Sphere(a)
         case mujoco.mjtGeom.mjGEOM_BOX:
             return geometry.Box(2 * a, 2 * b, 2 * c)
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
@@ -212,7 +233,10 @@ def _shape(geom) -> geometry.Shape:
             return geometry.Cylinder(a, 2 * b)
         case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
             return geometry.Ellipsoid(a, b, c)
-    raise ValueError(f"geom {geom.name}: no Drake shape for {kind}")
+        case mujoco.mjtGeom.mjGEOM_MESH:
+            vertices, _ = mesh_data(model, int(model.geom_dataid[geom]))
+            return geometry.Convex(vertices.T.astype(float), name)
+    raise ValueError(f"geom {name}: no Drake shape for {kind}")
 
 
 def _exclude(plant: MultibodyPlant, scene: SceneGraph, model: mujoco.MjModel) -> None:
@@ -289,8 +313,10 @@ def foot_forces(world: World) -> np.ndarray:
     for i in range(contacts.num_hydroelastic_contacts()):
         contact = contacts.hydroelastic_contact_info(i)
         surface = contact.contact_surface()
-        for shape in {surface.id_M(), surface.id_N()} & set(world.feet):
-            forces[world.feet.index(shape)] += abs(contact.F_Ac_W().translational()[2])
+        touching = {surface.id_M(), surface.id_N()}
+        for foot, shapes in enumerate(world.feet):
+            if touching & shapes:
+                forces[foot] += abs(contact.F_Ac_W().translational()[2])
     return forces
 
 
@@ -300,8 +326,8 @@ def _sensordata(world: World, qpos: np.ndarray, qvel: np.ndarray, forces: np.nda
     data.qpos[:], data.qvel[:] = qpos, qvel
     for stage in KINEMATICS:
         stage(model, data)
-    for name, force in zip(FEET, forces, strict=True):
-        data.sensordata[world.robot.sensor(f"{name}_touch")] = force
+    for name, force in zip(TOUCH_SENSORS, forces, strict=True):
+        data.sensordata[world.robot.sensor(name)] = force
     return data.sensordata.copy()
 
 

@@ -1,4 +1,4 @@
-"""What the commands that try policies share: the engines to choose from, and checks of options.
+"""For all commands that try a policy: the engines to choose from, and checks of options.
 
 Imports no JAX, so that a command checks its arguments quickly.
 """
@@ -43,7 +43,7 @@ def require_engine(engine: Engine, robot: "Robot") -> None:
     if engine == "drake":
         from kslc_jax.evaluation import drake
 
-        drake.require_plain(robot)
+        drake.require_hinged(robot)
 
 
 def check_trials(speeds: Sequence[float], seeds: int, seconds: float) -> None:

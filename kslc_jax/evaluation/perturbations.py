@@ -6,7 +6,7 @@ arguments quickly.
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,6 +92,14 @@ def scaled(condition: str, factors: dict[str, float]) -> str:
     if factor == 1.0:
         return condition
     return f"{name}{between}{float(f'{float(value) * factor:.2g}'):g}"  # 150, not 1.5e+02
+
+
+def left_out(wanted: Sequence[str], tried: Sequence[str]) -> str:
+    """A message that names the perturbations that are wanted but not tried; empty without any."""
+    there = {condition.partition("=")[0] for condition in tried}
+    names = dict.fromkeys(condition.partition("=")[0] for condition in wanted)
+    missing = ", ".join(name for name in names if name not in there)
+    return f"left out, because robot or engine lacks it: {missing}" if missing else ""
 
 
 def disturbed(randomize: RandomizeConfig, punch: float, hold_arms: bool) -> RandomizeConfig:

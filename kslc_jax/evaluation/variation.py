@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from kslc_jax import similar
+from kslc_jax import maths, similar
 from kslc_jax.config import ConfigError, RandomizeConfig
 from kslc_jax.evaluation import perturbations
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robot import Robot
 
-FEET = ("left_foot", "right_foot")
-"""Box geoms of the feet at high fidelity."""
+LEVEL = 0.999
+"""Least cosine between a foot box's z axis at home and the vertical, for `sole`."""
 
 TILT = 0.003
 """Largest tilt of a varied sole about each horizontal axis [rad]. Two to four of its corners then
@@ -57,7 +57,7 @@ def _possible(changes: dict[str, Any], robot: Robot) -> bool:
 def require(randomize: RandomizeConfig, variation: Variation, robot: Robot) -> None:
     """ConfigError if the robot lacks a part that the changes need.
 
-    `hands` and held arms need arms; `sole` needs feet that are boxes.
+    `hands` and held arms need arms; `sole` needs feet of one box each, with its z axis upwards.
     """
     if lacking := _lacking(randomize, variation, robot):
         raise ConfigError(f"{lacking}; leave it out")
@@ -67,17 +67,23 @@ def _lacking(randomize: RandomizeConfig, variation: Variation, robot: Robot) -> 
     """The reason why the robot cannot have the changes; empty if it can."""
     if randomize.held_arms and not robot.is_arm.any():
         return f"held arms: {robot.name} has no arms"
-    if variation.sole and min(_foot_boxes(robot)) < 0:
-        return f"sole: the feet of {robot.name} are no boxes"
+    if variation.sole and len(_foot_boxes(robot)) < 2:
+        return f"sole: a foot of {robot.name} is not one box with its z axis upwards"
     if variation.hands and not len(robot.hand_body_ids):
         return f"hands: {robot.name} has no arms"
     return ""
 
 
-def _foot_boxes(robot: Robot) -> list[int]:
-    """Geoms of the left and the right foot; -1 where the robot has no geom of the name."""
+@functools.lru_cache(maxsize=8)
+def _foot_boxes(robot: Robot) -> tuple[int, ...]:
+    """Geoms of the left and the right foot, without those that `sole` cannot change."""
     model = robot.mj_model
-    return [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_GEOM, foot) for foot in FEET]
+    data = mujoco.MjData(model)
+    data.qpos[:] = robot.default_qpos
+    mujoco.mj_kinematics(model, data)
+    alone = (int(foot[0]) for foot in robot.foot_shapes if len(foot) == 1)
+    is_box = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+    return tuple(foot for foot in alone if is_box[foot] and data.geom_xmat[foot, 8] > LEVEL)
 
 
 def sample(variation: Variation, robot: Robot, key: jax.Array) -> Body:
@@ -152,14 +158,18 @@ def _soles(inset: float, robot: Robot, key: jax.Array, fields: Fields) -> Fields
     """Random foot boxes that lie inside the described ones and are tilted by up to `TILT`."""
     model = robot.mj_model
     feet = np.array(_foot_boxes(robot))
+    described = jnp.asarray(model.geom_quat[feet])
     key_sides, key_tilt = jax.random.split(key)
     sides = inset * jax.random.uniform(key_sides, (2, 2, 2))  # foot, axis, front or back
     tilt = jax.random.uniform(key_tilt, (2, 2), minval=-TILT, maxval=TILT)
     shift, shrink = 0.5 * (sides[..., 1] - sides[..., 0]), 0.5 * sides.sum(-1)
-    quat = jnp.concatenate([jnp.ones((2, 1)), 0.5 * tilt, jnp.zeros((2, 1))], axis=1)
+    shift = jnp.concatenate([shift, jnp.zeros((2, 1))], axis=1)  # frame of the box
+    turn = jnp.concatenate([jnp.ones((2, 1)), 0.5 * tilt, jnp.zeros((2, 1))], axis=1)
     return {
         "geom_size": jnp.asarray(model.geom_size).at[feet, :2].add(-shrink),
-        "geom_pos": fields["geom_pos"].at[feet, :2].add(shift),
-        "geom_quat": jnp.asarray(model.geom_quat).at[feet].set(quat),
+        "geom_pos": fields["geom_pos"].at[feet].add(jax.vmap(maths.quat_rotate)(described, shift)),
+        "geom_quat": jnp.asarray(model.geom_quat)
+        .at[feet]
+        .set(jax.vmap(maths.quat_multiply)(described, turn)),
         "geom_sameframe": jnp.asarray(model.geom_sameframe).at[feet].set(0),  # use geom_quat
     }

@@ -23,7 +23,7 @@ from kslc_jax.robots.soles import Sole
 
 CLEARANCE = 0.0731
 """Height of the soles above the ground at the start of an episode, as a share of the standing
-height; XBot-L's, of which the robot falls 6.5 cm."""
+height. The value is XBot-L's: its soles begin 6.5 cm above the ground."""
 
 TOUCH_BORDER = 0.008
 """The site of the touch sensor is larger than the sole by this length [m] on each side."""

@@ -20,9 +20,9 @@ THINNEST = 0.3
 
 
 THICKER = 1.5
-"""A thigh's capsule has the hip's shapes inside if it is not thicker by more than this factor.
+"""A thigh's capsule covers the hip's shapes, too, if that makes it thicker by at most this factor.
 
-Otherwise the legs of a robot with wide hips would be apart where its hips are not."""
+A thicker one would keep the legs apart where only the hips are wide."""
 
 _MIRROR = np.array([1.0, -1.0, 1.0])
 

@@ -60,8 +60,9 @@ def join(
     try:
         jax.distributed.initialize(coordinator, processes, index)
     except (RuntimeError, ValueError, OSError) as error:
-        where = coordinator or "what this machine's scheduler says"
-        raise ConfigError(f"--coordinator: cannot join by {where}: {first_line(error)}") from error
+        by = f"{coordinator}" if coordinator else "auto, with the scheduler's settings"
+        why = first_line(error)
+        raise ConfigError(f"--coordinator {by}: cannot join the processes: {why}") from error
 
 
 def splits(config: Config, count: int) -> bool:
@@ -84,7 +85,8 @@ def choose(config: Config, wanted: int | None = None) -> list[jax.Device]:
     held = Counter(d.process_index for d in there)
     least = min(held.values())
     if wanted is not None and not 1 <= wanted <= least:
-        raise ConfigError(f"--devices: {wanted} of {least} {there[0].platform} devices")
+        kind = there[0].platform
+        raise ConfigError(f"--devices: {wanted} asked for, a process has {least} ({kind})")
     if wanted is None:
         one = jax.default_backend() == "cpu" or physics.resolve_engine(config.physics) == "mujoco"
         counts = range(1 if one else least, 0, -1)
@@ -181,7 +183,7 @@ def several() -> bool:
 
 
 def is_first() -> bool:
-    """True in process 0, the only process that reads, writes and prints."""
+    """True in process 0, the only one that writes the run folder and shows progress."""
     return jax.process_index() == 0
 
 

@@ -121,6 +121,7 @@ def check(config: Config, devices: int = 1, seeds: int = 1) -> None:
     if need > memory:
         many = "--seeds, " * (seeds > 1)
         raise ConfigError(
-            f"{many}env.num_envs, env.frames, ppo.rollout_steps, ppo.minibatches and network sizes "
-            f"need about {shown(need)}; {device.device_kind} has {shown(memory)}"
+            f"the training needs about {shown(need)}, {device.device_kind} has {shown(memory)}: "
+            f"lower {many}env.num_envs, env.frames, ppo.rollout_steps or the network sizes, or "
+            "raise ppo.minibatches"
         )

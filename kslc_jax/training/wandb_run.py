@@ -76,7 +76,8 @@ def wandb_run(
         )
         run.define_metric("*", step_metric="env_steps")
     except Exception as error:  # no account, no network, a wrong setting
-        raise UserError(f"--wandb: {first_line(error)} (WANDB_MODE=offline needs none)") from error
+        other = "WANDB_MODE=offline needs no account and no network"
+        raise UserError(f"--wandb: {first_line(error)} ({other})") from error
     opened = WandbRun(run, warn)
     try:
         yield opened

@@ -23,8 +23,8 @@ SPEED_SECONDS = 0.5
 def shown(alive, start: int) -> range:
     """The steps of one trial to show, from `alive` [T].
 
-    These are the steps from `start` on. If the robot fell, they are as many steps, or all if there
-    are fewer, up to its fall.
+    Without a fall these are the steps from `start` to T. After a fall they are as many steps, or
+    fewer if it came earlier, up to the fall.
     """
     steps = len(alive)
     fall = steps if alive[-1] else int(alive.argmin())
