@@ -56,6 +56,9 @@ _FIELDS = {
     ),
     "gravity compensation": ("body_gravcomp",),
     "adhesion": ("geom_adhesion", "pair_adhesion"),
+    "objects of actuators and sensors": (
+        *("actuator_trnid", "actuator_trntype", "sensor_reftype", "sensor_refid", "sensor_dim"),
+    ),
 }
 """Groups of the compiled model's arrays. An older MuJoCo may lack an array. Do not change a group:
 add another one, because checkpoints store the checksums."""

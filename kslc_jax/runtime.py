@@ -10,6 +10,7 @@ import inspect
 import logging
 import math
 import os
+import platform
 import statistics
 import sys
 import time
@@ -214,6 +215,18 @@ def _read(path: Path) -> str:
 def usable_cpus() -> int:
     """Number of threads that this process can run at the same time, by affinity and quota."""
     return max(1, math.ceil(min(affine_cpus(), cpu_quota())))
+
+
+VECTORS = ("avx512f", "avx2", "avx")
+"""Flags in /proc/cpuinfo of vector instructions, the widest first. XLA chooses its code by them."""
+
+
+def cpu_model(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    """Name of the processor, and its widest vector instructions on Linux."""
+    facts = dict(line.split("\t", 1) for line in _read(cpuinfo).splitlines() if "\t" in line)
+    name, flags = (facts.get(key, "").strip("\t: ") for key in ("model name", "flags"))
+    widest = next((flag for flag in VECTORS if flag in flags.split()), "")
+    return ", ".join(filter(None, (name or platform.processor(), widest)))
 
 
 def choose_gl() -> None:

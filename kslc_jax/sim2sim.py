@@ -262,8 +262,8 @@ def _report(args: Args) -> None:
     options.require_engine(args.engine, robot)  # what is impossible fails before any trial
     for condition in args.conditions:
         trials.require(setting(args, engine, condition), robot)
-    for name in args.schedule:
-        schedules.named(name, policy.config, float(policy.curriculum.v_max), args.top)
+    v_max = float(policy.curriculum.v_max)
+    plans = [schedules.named(name, policy.config, v_max, args.top) for name in args.schedule]
     screen = tables.console()
     if missing := left_out(wanted, args.perturb):
         screen.print(missing)
@@ -280,6 +280,7 @@ def _report(args: Args) -> None:
     if args.json is not None:
         what = {"policy": policy_name(args.policy), "step": policy.step}
         how = {name: getattr(args, name) for name in CONDITIONS}
+        how["schedule"] = [plan.name for plan in plans]  # a file's name, not its path
         files.write_json(args.json, {**what, **how, "conditions": results})
 
 

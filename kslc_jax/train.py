@@ -262,8 +262,9 @@ def _train(args: Args, mesh: "Mesh | None") -> int:
     title, run_dir = headline(args)
     if args.resume:
         here = run_folder.circumstances(args.config, 1 if mesh is None else mesh.size, args.seeds)
-        one = files.seed_folder(run_dir, args.config.seed) if args.seeds > 1 else run_dir
-        title = f"{title} {run_folder.what_changed(one, here)}".rstrip()
+        seeds = [files.seed_folder(run_dir, seed) for seed in files.seeds_in(run_dir)]
+        news = (run_folder.what_changed(folder, here) for folder in seeds or [run_dir])
+        title = " ".join([title, *dict.fromkeys(filter(None, news))])
     shown = SeedsProgress if args.seeds > 1 else Progress
     progress = shown(args.config, None if devices.is_first() else Console(quiet=True))
     progress.say(f"{title}: {loop.describe(args.config, run_dir, mesh, args.seeds)}")

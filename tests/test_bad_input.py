@@ -155,7 +155,7 @@ class TestTrain:
 
     def test_processes_that_cannot_be(self, run_dir):
         where = ("--coordinator", "localhost:1234", "--processes", 2, "--process-index", 2)
-        assert "--process-index: 2 of 2" in self.refused(run_dir, *where)
+        assert "--process-index: 2 is too large" in self.refused(run_dir, *where)
         assert "--coordinator auto, with the scheduler's settings: cannot join" in self.refused(
             run_dir, "--coordinator", "auto"
         )

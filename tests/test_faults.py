@@ -47,7 +47,7 @@ from kslc_jax.checkpoint_format import CheckpointError
 from kslc_jax.checkup import trials
 from kslc_jax.config import XBOT_L, preset, to_dict
 from kslc_jax.robots import description
-from kslc_jax.training import memory, recorder, recovery, run_folder
+from kslc_jax.training import loop, memory, recorder, recovery, run_folder
 from kslc_jax.training.checkpoint import Store
 from kslc_jax.training.logs import MetricsFile
 
@@ -444,6 +444,20 @@ class TestAround:
         assert training(poison) == 0
         assert Store(training.dir).steps()[-1] == 4
 
+    @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGUSR1"])
+    def test_a_signal_while_it_compiles(self, name, training, monkeypatch, capsys):
+        """It does one train step, so that there is something to resume."""
+        compiles = loop.first_state_and_step
+
+        def signalled(*args):
+            signal.raise_signal(getattr(signal, name))
+            return compiles(*args)
+
+        monkeypatch.setattr(loop, "first_state_and_step", signalled)
+        assert training(lambda state: state) == 0
+        assert f"stopped by {name} at train step 1, saved" in capsys.readouterr().out
+        assert Store(training.dir).steps() == [1]
+
     @pytest.mark.parametrize("name", ["SIGHUP", "SIGUSR1"])
     def test_warnings_stop_like_sigterm(self, name, training, capsys):
         def poison(state):
@@ -763,8 +777,9 @@ class TestFullDisk:
 
         def poison(state):
             if int(state.step) == 7:
-                patience = time.monotonic() + 60
-                while not (disk / "checkpoints" / "4").exists() and time.monotonic() < patience:
+                patience, kept = time.monotonic() + 60, disk / "checkpoints"
+                # The checkpoint before must be gone, too: removing it makes room again.
+                while [*kept.glob("[0-9]*")] != [kept / "4"] and time.monotonic() < patience:
                     time.sleep(0.05)
                 with (disk / "filler").open("wb") as file, contextlib.suppress(OSError):
                     file.write(bytes(2**20))
@@ -1029,6 +1044,17 @@ class TestChangedRobot:
         values.add("key_qpos")
         derived = {"body_invweight0", "dof_invweight0", "body_subtreemass", "geom_rbound"}
         assert "body_mass" in silent and silent <= values | derived
+
+    @pytest.mark.parametrize(
+        "name", ["actuator_trnid", "sensor_objid", "sensor_refid", "geom_type", "body_parentid"]
+    )
+    def test_what_belongs_to_what_counts(self, name):
+        """Other whole numbers of the model would crash MuJoCo, so this asks for the checksum."""
+        model = copy.copy(robot.load("high").mj_model)
+        before = fingerprint._digests(robot.load("high"))
+        getattr(model, name)[-1] += 1
+        changed = dataclasses.replace(robot.load("high"), mj_model=model)
+        assert fingerprint._digests(changed) != before
 
     def test_every_option_of_the_simulation_counts(self):
         """The config has the time step and the iterations."""

@@ -22,7 +22,7 @@ from states import still_policy
 import kslc_jax.viewer
 from kslc_jax import config, files, play, robot
 from kslc_jax import policy as policy_lib
-from kslc_jax.config import PhysicsConfig, preset
+from kslc_jax.config import ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import schedules, trials
 from kslc_jax.viewer import films, following, session
 
@@ -190,15 +190,42 @@ def test_a_session_has_the_disturbances_of_play(still):
 
 
 def test_a_joystick_that_trembles_at_the_edge_of_the_dead_zone():
-    walks, seen = False, []
+    before, seen = (False, False), []
     for vx in (0.19, 0.2, 0.21, 0.19, 0.185, -0.19, 0.179, 0.19, 0.21):
-        velocity, walks = session.steady(np.array([vx, 0.0, 0.3]), walks, 0.2)
-        seen.append((round(float(velocity[0]), 3), walks))
-        assert velocity[2] == 0.3
+        velocity, before = session.steady(np.array([vx, 0.0, 0.3]), before, 0.2)
+        seen.append((round(float(velocity[0]), 3), before[0]))
+        assert velocity[2] == 0.3 and before[1]
     assert seen == [
         *((0.19, False), (0.2, False), (0.21, True), (0.2, True), (0.2, True), (-0.2, True)),
         *((0.179, False), (0.19, False), (0.21, True)),
     ]
+
+
+def test_a_joystick_that_trembles_at_the_edge_of_turning():
+    before, seen = (False, False), []
+    for rate in (0.095, 0.1, 0.105, 0.095, -0.095, 0.089, 0.095):
+        velocity, before = session.steady(np.array([0.0, 0.0, rate]), before, 0.2)
+        seen.append((round(float(velocity[2]), 3), before[1]))
+        assert not velocity[:2].any() and not before[0]
+    assert seen == [
+        *((0.095, False), (0.1, False), (0.105, True), (0.1, True), (-0.1, True)),
+        *((0.089, False), (0.095, False)),
+    ]
+
+
+def test_a_session_turns_on_at_the_edge_of_turning(still):
+    live = session.Session(still, C_MUJOCO)
+    moving = []
+    for rate in (0.095, 0.11, 0.095, 0.08):
+        live.advance(np.array([0.0, 0.0, rate]))
+        moving.append(bool(live._memory.env.command.moving))
+    assert moving == [False, True, True, False]
+
+
+def test_a_session_refuses_another_control_step(still):
+    slower = dataclasses.replace(C_MUJOCO, decimation=2 * C_MUJOCO.decimation)
+    with pytest.raises(ConfigError, match=r"acts every 0.01 s, but .* is 0.02 s"):
+        session.Session(still, slower)
 
 
 def test_a_session_walks_on_at_the_edge_and_a_fresh_one_stands(still):

@@ -6,6 +6,7 @@ same code with another physics config.
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -134,7 +135,15 @@ def require(setting: Setting, robot: Robot) -> None:
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:
-    """The policy's config, changed to the setting's conditions: fixed commands, no time limit."""
+    """The policy's config, changed to the setting's conditions: fixed commands, no time limit.
+
+    ConfigError if the physics has another control step than the policy was trained with.
+    """
+    if not math.isclose(setting.physics.control_dt, config.control_dt):
+        raise ConfigError(
+            f"the policy acts every {config.control_dt:g} s, but timestep x decimation of this "
+            f"physics is {setting.physics.control_dt:g} s"
+        )
     quiet = {} if setting.noise else {"noise_level": 0.0, "action_delay": 0.0, "action_noise": 0.0}
     return dataclasses.replace(
         config,

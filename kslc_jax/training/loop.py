@@ -32,7 +32,7 @@ from kslc_jax.training.checkpoint_process import ChildProcessStorage, LocalStora
 from kslc_jax.training.logs import Progress, range_reached
 from kslc_jax.training.recorder import NullRecorder, Record
 from kslc_jax.training.recovery import NonFiniteState, NumbersError
-from kslc_jax.training.stopping import stop_requests
+from kslc_jax.training.stopping import Stop, stop_requests
 
 
 @dataclass(frozen=True)
@@ -115,9 +115,9 @@ def train(
             progress.warn,
         )
         kept = recorder or NullRecorder()
-        return _train(
-            _Job(config, run_dir, resume, mesh, progress, kept, tracing, like, init, step)
-        )
+        job = _Job(config, run_dir, resume, mesh, progress, kept, tracing, like, init, step)
+        stop = stack.enter_context(stop_requests())  # also while it compiles
+        return _train(job, stop)
 
 
 def _program(config: Config, mesh: Mesh | None, seeds: int) -> tuple[Callable[[], TrainState], Any]:
@@ -132,8 +132,11 @@ def _done(state: TrainState) -> int:
     return int(np.asarray(state.step).min())
 
 
-def _train(job: _Job) -> TrainState:
-    """Compiles and trains. Goes back to a checkpoint after bad numbers, see `recovery`."""
+def _train(job: _Job, stop: Stop) -> TrainState:
+    """Compiles and trains. Goes back to a checkpoint after bad numbers, see `recovery`.
+
+    After a signal it does at least one train step, so that it can save.
+    """
     start = time.monotonic()
     if job.resume:
         state = job.restored()
@@ -153,7 +156,7 @@ def _train(job: _Job) -> TrainState:
     with contextlib.closing(job.profile):
         while True:
             try:
-                return _loop(job, state, compiled)
+                return _loop(job, state, compiled, stop)
             except NonFiniteState as bad:
                 state, attempt = _go_back(job, bad, attempt, back_to)
                 back_to = _done(state)
@@ -215,12 +218,12 @@ def _last_good(job: _Job) -> TrainState:
     return state
 
 
-def _loop(job: _Job, state: TrainState, step_fn: Any) -> TrainState:
-    """Trains step by step; saves and returns the last state."""
+def _loop(job: _Job, state: TrainState, step_fn: Any, stop: Stop) -> TrainState:
+    """Trains step by step until `stop` asks for the end; saves and returns the last state."""
     first = _done(state)
     record: Record = {}
     numerics, watchdog = job.recorder.check(state), Watchdog()
-    with stop_requests() as stop, contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as opened:
         devices.on_first(lambda: opened.enter_context(job.recorder.at(first)))
         for step in range(first + 1, job.config.num_updates + 1):
             numerics.before(state)

@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from kslc_jax import __version__, files, physics
+from kslc_jax import __version__, files, physics, runtime
 from kslc_jax import config as config_lib
 from kslc_jax.checkpoint_format import (
     has_checkpoints,
@@ -33,15 +33,19 @@ class RunError(UserError, RuntimeError):
     """A run folder cannot be used. The message gives the reason and a way out."""
 
 
-def versions() -> dict[str, str]:
-    """Versions that a result depends on.
+def versions() -> dict[str, str | int]:
+    """Versions of software and hardware that the bits of a result depend on.
 
     `git` is the commit of this package's own checkout, or "unknown" if it runs from none.
     """
     found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    found |= {d.name: d.version for d in importlib.metadata.distributions(name="jax-cuda12-plugin")}
     return {
         "python": platform.python_version(),
         "machine": platform.machine(),
+        "cpu": runtime.cpu_model(),
+        "threads": runtime.usable_cpus(),
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         "device": str(jax.devices()[0].device_kind),
         "kslc_jax": __version__,
         "git": _revision(Path(__file__)) or "unknown",

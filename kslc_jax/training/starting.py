@@ -46,6 +46,9 @@ def from_policy(
             changed := changes(policy.robot or {}, fingerprint(config.physics.robot))
         ):
             warnings.warn(f"{path} was trained with another robot: {changed}", stacklevel=2)
+        if policy.config.control_dt != config.control_dt:
+            steps = f"{policy.config.control_dt:g} s, this training one of {config.control_dt:g} s"
+            warnings.warn(f"{path} was trained with a control step of {steps}", stacklevel=2)
         try:
             jax.eval_shape(start, like, policy.params, policy.curriculum)
         except ValueError as error:

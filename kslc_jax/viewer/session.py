@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from kslc_jax import env, maths, physics, signals
+from kslc_jax.commands import TURNING
 from kslc_jax.config import Config, PhysicsConfig, RandomizeConfig
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.disturbances import PUNCH_SECONDS
@@ -32,25 +33,34 @@ STOP = 0.9
 """Share of the dead zone. A walking robot stops at commands below it."""
 
 
-def steady(velocity: np.ndarray, walks: bool, dead_zone: float) -> tuple[np.ndarray, bool]:
+def steady(
+    velocity: np.ndarray, before: tuple[bool, bool], dead_zone: float
+) -> tuple[np.ndarray, tuple[bool, bool]]:
     """Steadies a command at the edge of the dead zone, where a joystick may tremble.
 
     Walking begins above the dead zone and ends below `STOP` times it. In between, a walking robot
-    gets the slowest command of the training, at the edge of the dead zone.
+    gets the slowest command of the training, at the edge of the dead zone. The same holds for the
+    yaw rate, from which a standing robot begins to turn (`commands.TURNING`).
 
     Args:
       velocity: [3] wanted vx, vy [m/s], yaw rate [rad/s].
-      walks: True if the robot walked in the last step.
+      before: what this function returned at the last step; (False, False) at first.
       dead_zone: of the training's commands [m/s].
 
     Returns:
-      (command [3], True if the robot must walk).
+      (command [3], (True if the robot walks, True if the yaw rate alone makes it move)).
     """
-    speed = float(np.hypot(*velocity[:2]))
-    if not speed > dead_zone * (STOP if walks else 1.0):
-        return velocity, False
-    edge = dead_zone * (1.0 + EPSILON)
-    return velocity * np.array([*2 * [max(edge / speed, 1.0)], 1.0]), True
+    speed, rate = float(np.hypot(*velocity[:2])), abs(float(velocity[2]))
+    faster, walks = _held(speed, before[0], dead_zone)
+    quicker, turns = _held(rate, before[1], TURNING)
+    return velocity * np.array([faster, faster, quicker]), (walks, turns)
+
+
+def _held(size: float, on: bool, edge: float) -> tuple[float, bool]:
+    """(factor on a value of this size, True if it counts), see `steady`."""
+    if not size > edge * (STOP if on else 1.0):
+        return 1.0, False
+    return max(edge * (1.0 + EPSILON) / size, 1.0), True
 
 
 @flax.struct.dataclass
@@ -194,7 +204,7 @@ class Session:
         memory, view = _reset(self._config, self.policy.curriculum, key)
         # On a named device, like the loaded parameters. Else the second step compiles again.
         self._memory = jax.device_put(memory, jax.devices()[0])
-        self._lies, self._walks = 0.0, False
+        self._lies, self._moves = 0.0, (False, False)
         self._end_shove()
         self.view = jax.device_get(view)
         return self.view
@@ -254,7 +264,7 @@ class Session:
     def _asked(self, command: np.ndarray | None) -> Asked:
         dead_zone, by_hand = self._config.command.dead_zone, command is not None
         wanted = np.zeros(3) if command is None else np.asarray(command)
-        wanted, self._walks = steady(wanted, self._walks, dead_zone)
+        wanted, self._moves = steady(wanted, self._moves, dead_zone)
         return Asked(
             jnp.asarray(wanted, jnp.float32), jnp.asarray(by_hand), jnp.asarray(self._force)
         )
