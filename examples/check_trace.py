@@ -11,6 +11,7 @@ else 1.
 """
 
 import argparse
+import hashlib
 import json
 import runpy
 import sys
@@ -19,6 +20,16 @@ from pathlib import Path
 import numpy as np
 
 MEASURED = "quat", "angvel", "joint_pos", "joint_vel"
+
+
+def foreign_file(policy):
+    """The first file beside `policy` that another export has written; None if there is none."""
+    stored = json.loads(Path(policy).with_suffix(".json").read_text()).get("sha256", {})
+    for suffix, digest in stored.items():
+        path = Path(policy).with_suffix(suffix)
+        if not path.is_file() or hashlib.sha256(path.read_bytes()).hexdigest() != digest:
+            return path
+    return None
 
 
 def first_difference(controller_class, policy, tolerance):
@@ -53,6 +64,8 @@ if __name__ == "__main__":
     for path in (args.policy, args.program, *beside):
         if not Path(path).is_file():
             parser.error(f"no file '{path}'")
+    if foreign := foreign_file(args.policy):
+        print(f"warning: '{foreign}' is not the file that export wrote with the others")
     controller = runpy.run_path(str(args.program))["Controller"]
     difference = first_difference(controller, args.policy, args.tolerance)
     print(difference or "all targets agree")

@@ -37,6 +37,10 @@ WIDTH = 200
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
 
 
+SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+"""Commanded speeds [m/s] of XBot-L, if none are given."""
+
+
 @dataclass(frozen=True)
 class Args:
     """The trainings, their length, and their evaluation."""
@@ -62,8 +66,9 @@ class Args:
     """Environment steps of each training."""
     snapshots: int = 16
     """Policies that each training keeps along the way, for the learning curves."""
-    speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-    """Commanded speeds of the evaluation [m/s]."""
+    speeds: tuple[float, ...] | None = None
+    """Commanded speeds of the evaluation [m/s]. None: 0.5 to 4.0 in steps of 0.5, scaled to the
+    robot's size."""
     trials: int = 8
     """Trials per speed."""
     fidelity: Fidelity = "high"
@@ -108,6 +113,11 @@ def jobs(args: Args) -> Iterator[Job]:
                 yield _job(args, variant, ablation, seed)
 
 
+def _commanded(args: Args) -> tuple[float, ...]:
+    """The speeds of the evaluation [m/s]."""
+    return options.speeds_for(args.robot, args.speeds, SPEEDS)
+
+
 def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     from kslc_jax.checkpoint_format import has_checkpoints
 
@@ -122,7 +132,7 @@ def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
     # A resume names its preset too: train refuses it if the run began with another preset.
     resume = ("--resume",) if has_checkpoints(folder) else ()
     run = ("--run-dir", str(folder), *length, *resume)
-    speeds = ("--speeds", *map(str, args.speeds))
+    speeds = ("--speeds", *map(str, _commanded(args)))
     fidelity = ("--fidelity", args.fidelity)
     trials = ("--seeds", str(args.trials), *fidelity)
     kept = ("--json", str(folder / files.EVALUATION))
@@ -172,7 +182,7 @@ def is_done(job: Job, args: Args) -> bool:
     except (OSError, ValueError, KeyError, TypeError):
         return False
     asked = (args.fidelity, args.trials)
-    return how == asked and speeds == args.speeds and trained(job.folder) >= args.steps
+    return how == asked and speeds == _commanded(args) and trained(job.folder) >= args.steps
 
 
 def call(module: str, arguments: tuple[str, ...]) -> bool:

@@ -7,6 +7,7 @@ finds the first difference.
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,16 +37,37 @@ def paths(out: Path) -> list[Path]:
 
 
 def write(policy: Policy, out: Path) -> list[Path]:
-    """Writes the files beside `out`; returns `paths`."""
+    """Writes the files beside `out`, which is there already; returns `paths`.
+
+    The data have more than `metadata`: the robot, its joints' ranges [rad], the latency budget [s],
+    and checksums, by which one sees if four files belong together.
+    """
     data, model, trace = beside = paths(out)
-    budget = policy.config.env.action_delay * policy.config.control_dt
-    files.write_json(data, metadata(policy) | {"latency_budget": budget})
     with files.saving(model) as part:
         part.write_text(mjcf(policy), encoding="utf-8")
     numbers: dict[str, Any] = golden(policy)
     with files.saving(trace) as part:
         np.savez_compressed(part, **numbers)
+    files.write_json(data, metadata(policy) | _facts(policy) | {"sha256": checksums(out)})
     return beside
+
+
+def _facts(policy: Policy) -> dict[str, Any]:
+    from kslc_jax import physics
+
+    robot = physics.robot_for(policy.config.physics)
+    return {
+        "robot": robot.name,
+        "joint_lower": robot.joint_lower.tolist(),
+        "joint_upper": robot.joint_upper.tolist(),
+        "latency_budget": policy.config.env.action_delay * policy.config.control_dt,
+    }
+
+
+def checksums(out: Path) -> dict[str, str]:
+    """SHA-256 of `out` and of the files beside it, without the data, by their suffix."""
+    there = [out, *(path for path in paths(out) if path.suffix != ".json")]
+    return {path.suffix: hashlib.sha256(path.read_bytes()).hexdigest() for path in there}
 
 
 def metadata(policy: Policy) -> dict[str, Any]:

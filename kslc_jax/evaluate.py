@@ -25,6 +25,9 @@ from kslc_jax.evaluation.tables import console, table
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
+SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+"""Commanded speeds [m/s] of XBot-L, if none are given."""
+
 CONDITIONS = ("fidelity", "ground", "seeds", "seconds", "noise", "seed")
 """Options that the JSON file records."""
 
@@ -35,8 +38,9 @@ class Args:
 
     policy: tyro.conf.Positional[Path]
     """Run folder, checkpoint folder, or name of a shipped policy."""
-    speeds: tuple[float, ...] = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-    """Commanded forward speeds [m/s]."""
+    speeds: tuple[float, ...] | None = None
+    """Commanded forward speeds [m/s]. None: 0 to 4.0 in steps of 0.5, scaled to the robot's
+    size."""
     seeds: int = 8
     """Trials per speed."""
     seconds: float = 20.0
@@ -70,7 +74,8 @@ def sweep(
     terrain = None if args.ground is None else perturbations.terrain(args.ground)
     engine = trials.engine(policy, args.fidelity, terrain)
     setting = trials.Setting(engine, seconds=args.seconds, noise=args.noise)
-    rows = measure(policy, setting, args.speeds, args.seeds, args.seed, progress)
+    speeds = options.speeds_for(policy.config.physics.robot, args.speeds, SPEEDS)
+    rows = measure(policy, setting, speeds, args.seeds, args.seed, progress)
     return [row | trained.beyond(policy, setting, (row["command"], 0.0, 0.0)) for row in rows]
 
 

@@ -52,9 +52,6 @@ SCHEDULE = "random"
 
 DRAKE_SECONDS = 20.0
 
-SPEED = "curriculum.v_limit"
-"""Field whose `similar.factors` entry is the factor on speeds."""
-
 
 @dataclass(frozen=True)
 class Size:
@@ -82,7 +79,7 @@ class Size:
         factors = similar.factors(robot)
 
         def own(speeds: tuple[float, ...]) -> tuple[float, ...]:
-            return tuple(bars_lib.scaled(speed, factors[SPEED]) for speed in speeds)
+            return tuple(bars_lib.scaled(speed, factors[similar.SPEED]) for speed in speeds)
 
         return dataclasses.replace(
             self,
@@ -242,7 +239,7 @@ def _harsh(size: Size, args: Args, policy, progress: Progress) -> dict[str, dict
     from kslc_jax.evaluation import variation
 
     robot = physics.robot_for(policy.config.physics)
-    factor, found = similar.factors(robot)[SPEED], {}
+    factor, found = similar.factors(robot)[similar.SPEED], {}
     for i, (condition, (wanted, speeds)) in enumerate(bars_lib.HARSH.items()):
 
         def told(share: float, i: int = i) -> None:
@@ -391,7 +388,7 @@ def _report(args: Args, path: Path) -> None:
             bar.update(tasks[name], completed=share)
 
         found = measure(size, args, policy, progress, keep_part)
-    against = bars(found, factors[SPEED], arms=bool(robot.is_arm.any()))
+    against = bars(found, factors[similar.SPEED], arms=bool(robot.is_arm.any()))
     screen.print(table(against, f"{path}, train step {policy.step}"))
     keep(found | {"bars": [dataclasses.asdict(one) for one in against]})
 

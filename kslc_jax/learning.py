@@ -23,6 +23,9 @@ from kslc_jax.cli import Paths
 from kslc_jax.config import ConfigError, Fidelity
 from kslc_jax.evaluation import options
 
+SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
+"""Commanded speeds [m/s] of XBot-L, if none are given."""
+
 
 @dataclass(frozen=True)
 class Args:
@@ -30,8 +33,9 @@ class Args:
 
     runs: Paths
     """Run folders."""
-    speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
-    """Commanded forward speeds [m/s]."""
+    speeds: tuple[float, ...] | None = None
+    """Commanded forward speeds [m/s]. None: 0.5 to 3.5 in steps of 0.5, scaled to the robot's
+    size."""
     seeds: int = 4
     """Trials per speed and policy."""
     seconds: float = 10.0
@@ -79,7 +83,7 @@ def curve(
         rows = measure(
             policy,
             setting,
-            args.speeds,
+            options.speeds_for(policy.config.physics.robot, args.speeds, SPEEDS),
             args.seeds,
             describe=lambda trace, speed, robot, dt: gait_metrics.speed(trace, speed, dt),
         )

@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 STRIPS = (".png", ".jpg")
 """Suffixes of gait strips."""
 
+SPEEDS = (2.0, 3.5)
+"""Speeds of strip and video [m/s] of XBot-L, if none are given."""
+
 SETTLE_SECONDS = 4.0
 """Time in which the robot gathers speed before a strip or video shows it [s]."""
 
@@ -84,8 +87,9 @@ class Args:
     2 s after the start."""
     hold_arms: bool = False
     """The arms follow random targets, at most 0.3 rad/s fast, in place of the policy's actions."""
-    speeds: tuple[float, ...] = (2.0, 3.5)
-    """Commanded forward speeds of strip and video [m/s]; --schedule replaces them."""
+    speeds: tuple[float, ...] | None = None
+    """Commanded forward speeds of strip and video [m/s]; --schedule replaces them. None: 2.0 and
+    3.5, scaled to the robot's size."""
     seconds: float | None = None
     """Time that strip and video show. None: 2 s per speed, after 4 s in which the robot gathers
     speed; or 10 s of a schedule, from its start."""
@@ -98,8 +102,7 @@ class Args:
     def __post_init__(self):
         if not 0 < self.shown_seconds < math.inf:
             raise ConfigError("seconds must be positive")
-        if not (self.speeds and all(map(math.isfinite, self.speeds))):
-            raise ConfigError("speeds: name at least one, finite")
+        options.check_speeds(self.speeds)
         require_seed(self.seed)
         options.check_disturbances(self.punch, self.top)
         if self.top is not None and self.schedule is None:
@@ -155,6 +158,11 @@ def randomize(args: Args) -> RandomizeConfig:
     return perturbations.disturbed(trials.NOMINAL, args.punch, args.hold_arms)
 
 
+def speeds_of(args: Args, policy: "Policy") -> tuple[float, ...]:
+    """The commanded speeds [m/s] of strip and video."""
+    return options.speeds_for(policy.config.physics.robot, args.speeds, SPEEDS)
+
+
 # ---------------------------------------------------------------------------------------- pictures
 
 
@@ -170,7 +178,7 @@ def record(args: Args, policy):
     from kslc_jax.evaluation import trials
 
     schedule = plan(args, policy)
-    speeds, settle = ((0.0,), 0.0) if schedule else (args.speeds, SETTLE_SECONDS)
+    speeds, settle = ((0.0,), 0.0) if schedule else (speeds_of(args, policy), SETTLE_SECONDS)
     velocities = np.zeros((len(speeds), 3))
     velocities[:, 0] = speeds
     engine = trials.engine(policy, args.fidelity, args.terrain)
@@ -201,7 +209,11 @@ def draw(args: Args, policy) -> None:
     render.require_gl()  # before the simulation, which takes a minute
     trace, start, dt = record(args, policy)
     robot = render.shown_robot(policy, args.terrain)
-    tried = [args.schedule] if args.schedule else [f"{speed:g} m/s" for speed in args.speeds]
+    tried = (
+        [args.schedule]
+        if args.schedule
+        else [f"{speed:g} m/s" for speed in speeds_of(args, policy)]
+    )
     for name, up in zip(tried, trace.alive[-1], strict=True):
         if not up:
             print(f"warning: fell at {name}; what is shown ends there")

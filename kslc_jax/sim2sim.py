@@ -61,6 +61,9 @@ MOST_LATENCY = 50
 """Largest delay of the actions [control steps]."""
 
 
+SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+"""Commanded speeds [m/s] of XBot-L, if none are given."""
+
 MUJOCO_ONLY = ("variation", "terrain", "punch")
 """Changes of `perturbations.changes` that Drake does not have."""
 
@@ -74,8 +77,9 @@ class Args:
     engine: options.Engine = "mujoco"
     """mujoco: C MuJoCo on all cores. drake: one robot at a time, slow; it needs the package drake
     (pip install 'kslc_jax[drake]')."""
-    speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-    """Commanded forward speeds [m/s]."""
+    speeds: tuple[float, ...] | None = None
+    """Commanded forward speeds [m/s]. None: 0.5 to 4.0 in steps of 0.5, scaled to the robot's
+    size."""
     sideways: float = 0.0
     """Sideways velocity commanded with every speed [m/s], positive to the left."""
     turn: float = 0.0
@@ -209,8 +213,9 @@ def _rows(
         plans = [schedules.named(n, policy.config, v_max, args.top) for n in args.schedule]
         return scheduled.measure(policy, conditions, plans, args.seeds, args.seed, progress)
     vy, yaw_rate = args.sideways, args.turn
+    speeds = options.speeds_for(policy.config.physics.robot, args.speeds, SPEEDS)
     rows = measure(
-        policy, conditions, args.speeds, args.seeds, args.seed, progress, vy=vy, yaw_rate=yaw_rate
+        policy, conditions, speeds, args.seeds, args.seed, progress, vy=vy, yaw_rate=yaw_rate
     )
     return [
         row | trained.beyond(policy, conditions, (row["command"], vy, yaw_rate)) for row in rows

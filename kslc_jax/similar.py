@@ -40,6 +40,10 @@ def preset(name: str, robot: str = config_lib.XBOT_L, without: tuple[str, ...] =
     return _changed(config, dict(about.config), f"{about.path}: config")
 
 
+SPEED = "curriculum.v_limit"
+"""Field whose entry in `factors` is the factor on speeds."""
+
+
 def scaled(config: Config, robot: Robot) -> Config:
     """A config for XBot-L, scaled to another robot."""
     changes = {

@@ -42,7 +42,7 @@ from kslc_jax import (
     train_step,
 )
 from kslc_jax.commands import Command
-from kslc_jax.evaluation import gait_metrics, perturbations, trials, variation
+from kslc_jax.evaluation import gait_metrics, options, perturbations, trials, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.robots import copying, description
 from kslc_jax.robots.description import RobotError
@@ -477,6 +477,30 @@ def test_legs_may_have_neither_roll_nor_yaw(biped, setup):
     x = SimpleNamespace(signals=SimpleNamespace(joint_pos=joints))
     value = rewards.default_joint_pos(setup.rewards, flat, setup.control_dt, x)
     assert float(value) == pytest.approx(1.0 - 0.01 * 0.2 * 3.0, abs=1e-6)
+
+
+def test_every_field_of_the_config_scales_or_is_known_not_to():
+    """A new field that depends on the robot's size belongs in `similar.factors`, else in the
+    file."""
+
+    def names(part, prefix=""):
+        for field in dataclasses.fields(part):
+            value = getattr(part, field.name)
+            inside = dataclasses.is_dataclass(value)
+            yield from names(value, f"{prefix}{field.name}.") if inside else [prefix + field.name]
+
+    same = (Path(BIPED).parent / "fields_of_no_size.txt").read_text().split()
+    terrain = dataclasses.replace(config.preset("laptop").physics, terrain=config.TerrainConfig())
+    whole = dataclasses.replace(config.preset("laptop"), physics=terrain)
+    assert {*names(whole)} - {*similar.factors(robot.load(name=BIPED))} == {*same}
+
+
+def test_speeds_of_trials_fit_the_robot():
+    ours = (0.5, 4.0)
+    assert options.speeds_for(config.XBOT_L, None, ours) == ours
+    assert options.speeds_for(BIPED, (1.0,), ours) == (1.0,)
+    root = np.sqrt(robot.load(name=BIPED).length_ratio)
+    assert options.speeds_for(BIPED, None, ours) == pytest.approx(np.array(ours) * root, abs=0.005)
 
 
 def test_a_robot_is_tried_under_what_it_can_have():

@@ -1,11 +1,13 @@
 """Behaviour of all commands: one line for an error, its exit code, process-wide settings."""
 
+import dataclasses
 import json
 import logging
 import math
 import os
 import subprocess
 import sys
+import typing
 import warnings
 from pathlib import Path
 
@@ -14,7 +16,23 @@ import numpy as np
 import pytest
 import slow
 
-from kslc_jax import cli, compare, doctor, physics, robot, runtime, train
+from kslc_jax import (
+    cli,
+    compare,
+    doctor,
+    evaluate,
+    export,
+    judge,
+    learning,
+    physics,
+    play,
+    plots,
+    reproduce,
+    robot,
+    runtime,
+    sim2sim,
+    train,
+)
 from kslc_jax.config import ConfigError
 from kslc_jax.errors import MissingPackage, UserError
 from kslc_jax.training.recovery import NumbersError
@@ -294,6 +312,41 @@ def test_variables_of_a_notebook_count_again_after_a_command():
     words = [sys.executable, "-c", code]
     done = subprocess.run(words, env=env, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[('float32', None)] float64 1"
+
+
+COMMANDS = {
+    "train": [train.Args],
+    "evaluate": [evaluate.Args],
+    "sim2sim": [sim2sim.Args],
+    "judge": [judge.Args],
+    "play": [play.Args],
+    "export": [export.Args],
+    "compare": [compare.Args],
+    "learning": [learning.Args],
+    "reproduce": [reproduce.Args],
+    "plots": typing.get_args(plots.Drawing),
+    "doctor": [doctor.Check, doctor.Robot, doctor.Replay],
+}
+
+
+def test_public_options_stay():
+    """Users' scripts have them. A new option goes into the file."""
+
+    def names(kind, prefix=""):
+        for field in dataclasses.fields(kind):
+            inside = typing.get_type_hints(kind)[field.name]
+            if dataclasses.is_dataclass(inside):
+                yield from names(inside, "" if field.name == "config" else f"{prefix}{field.name}.")
+            else:
+                yield prefix + field.name
+
+    found = []
+    for command, kinds in COMMANDS.items():
+        for kind in kinds:
+            title = command if len(kinds) == 1 else f"{command} {kind.__name__.lower()}"
+            found += [title, *(f"{title} {name}" for name in names(kind))]
+    stored = (Path(__file__).parent / "data" / "options.txt").read_text().splitlines()
+    assert sorted(found) == stored
 
 
 def test_every_option_of_jax_is_known():

@@ -8,8 +8,11 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from states import XBOT
 
 import kslc_jax
+from kslc_jax import observations
+from kslc_jax.config import preset
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -91,6 +94,7 @@ def test_the_citation_has_the_packages_version():
 
 
 HOMES = ("home", "Users", "root", "tmp", "work", "workspace", "mnt", "scratch", "private")
+HOMES += ("data", "opt", "srv", "gpfs", "lustre")
 """Folders under / in which people and machines work."""
 
 
@@ -138,3 +142,22 @@ def test_what_documents_name_in_the_code_exists(path):
                 for alias in node.names:
                     whole = f"{node.module}.{alias.name}"
                     assert hasattr(module, alias.name) or importlib.util.find_spec(whole), whole
+
+
+def test_the_readme_has_a_place_for_every_module():
+    text = (ROOT / "README.md").read_text()
+    for path in (ROOT / "kslc_jax").iterdir():
+        name = path.name if path.is_dir() else path.stem
+        if not name.startswith("__"):
+            assert any(f"`{x}`" in text for x in (name, f"{name}.py", f"{name}/")), name
+
+
+def test_the_drawing_of_a_train_step_has_the_laptop_presets_sizes():
+    text = (ROOT / "docs" / "train_step.svg").read_text()
+    laptop = preset("laptop")
+    actor = sum(c.width for c in observations.actor_table(XBOT))
+    critic = sum(c.width for c in observations.critic_table(XBOT, laptop.env.critic_memory))
+    assert f"[N, {actor}]" in text and f"[B, K, {actor}]" in text
+    assert f"[N, {critic}]" in text and f"[B, Kp, {critic}]" in text
+    assert f"{laptop.ppo.epochs} epochs x {laptop.ppo.minibatches} minibatches" in text
+    assert f"B = {laptop.minibatch_size:,} samples" in text

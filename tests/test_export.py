@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -381,6 +382,24 @@ def test_a_golden_trace_is_what_its_policy_does(acting, contracted):
 
 def test_the_runner_follows_the_golden_trace(runner, checker, contracted):
     assert checker.first_difference(runner.Controller, contracted, 1e-4) is None
+
+
+def test_the_data_name_the_robot_and_the_other_files(acting, checker, contracted, tmp_path):
+    data = json.loads(contracted.with_suffix(".json").read_text())
+    assert data["robot"] == "XBot-L" and set(data["sha256"]) == {".onnx", ".xml", ".npz"}
+    model = mujoco.MjModel.from_xml_path(str(contracted.with_suffix(".xml")))
+    ranges = np.array([model.joint(name).range for name in data["joint_names"]])
+    np.testing.assert_allclose(np.c_[data["joint_lower"], data["joint_upper"]], ranges, atol=1e-6)
+    assert checker.foreign_file(contracted) is None
+    for path in contracted.parent.iterdir():  # under another name, as a whole
+        shutil.copy(path, tmp_path / f"run{path.suffix}")
+    assert checker.foreign_file(tmp_path / "run.onnx") is None
+    for suffix in (".onnx", ".xml", ".npz"):
+        changed = tmp_path / f"run{suffix}"
+        before = changed.read_bytes()
+        changed.write_bytes(before[:-1] + b"x")
+        assert checker.foreign_file(tmp_path / "run.onnx") == changed
+        changed.write_bytes(before)
 
 
 def test_the_checker_names_the_first_wrong_target(runner, checker, contracted):

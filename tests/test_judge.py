@@ -109,11 +109,12 @@ def test_harsh_conditions_are_tried_as_named(monkeypatch):
     args = judge.Args((Path("p"),), harsh=True)
     found = judge._harsh(judge.FULL, args, policy, lambda name, share: None)
     assert [name for name in found] == list(HARSH) and found["punch=300"]["wanted"] == 0.95
-    punched, held, rough, waves, slope = (setting for setting, _, _ in seen)
+    punched, harder, held, rough, waves, slope = (setting for setting, _, _ in seen)
     assert punched.randomize.punch == (300, 300) and punched.seconds == 30
+    assert harder.randomize.punch == (500, 500) and found["punch=500"]["wanted"] == 0.0  # only told
     assert held.randomize.held_arms == 1 and not held.physics.terrain.kinds
     assert rough.physics.terrain.rough == 0.05 and slope.physics.terrain.slope == 10
-    assert seen[3][1:] == ((3.0,), 32) and waves.physics.terrain.rough == 0.03
+    assert seen[4][1:] == ((3.0,), 32) and waves.physics.terrain.rough == 0.03
 
 
 def test_harsh_conditions_fit_the_size_of_the_robot():
@@ -121,11 +122,11 @@ def test_harsh_conditions_fit_the_size_of_the_robot():
     xbot = robot.load()
     assert variation.for_robot(list(HARSH), xbot) == tuple(HARSH)
     small = dataclasses.replace(xbot, length_ratio=0.25, mass_ratio=0.5)
-    own = ("punch=150", "arms=1", "rough:0.013", "rough:0.0075", "slope:10")
+    own = ("punch=150", "punch=250", "arms=1", "rough:0.013", "rough:0.0075", "slope:10")
     assert variation.for_robot(list(HARSH), small) == own
     biped = robot.load(name=str(Path(__file__).parent / "data" / "biped.toml"))
     assert [name[:4] for name in variation.for_robot(list(HARSH), biped)] == [
-        *("punc", "roug", "roug", "slop")
+        *("punc", "punc", "roug", "roug", "slop")
     ]
 
 
@@ -153,7 +154,7 @@ def test_a_smaller_robot_has_slower_bars_and_one_without_arms_has_none_on_them()
 
 def test_a_robot_of_another_size_is_tried_at_its_own_speeds():
     """Lengths scale with l, speeds with sqrt(l), masses with m, torques with m l."""
-    xbot = robot.load()
+    xbot = robot.load("high")
     assert judge.FULL.for_robot(xbot) == judge.FULL
     quarter = dataclasses.replace(xbot, length_ratio=0.25, mass_ratio=0.5)
     small = judge.FULL.for_robot(quarter)

@@ -16,7 +16,7 @@ import kslc_jax.evaluation
 from kslc_jax import curriculum, env, randomize, robot, sim2sim
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
-from kslc_jax.evaluation import gait_metrics, measure, trials
+from kslc_jax.evaluation import gait_metrics, measure, perturbations, trials
 
 
 @pytest.fixture(scope="module")
@@ -258,3 +258,22 @@ def test_a_missing_engine_says_how_to_get_it(monkeypatch, capsys):
 def test_a_condition_that_is_asked_for_is_set(name):
     setting = sim2sim.setting(sim2sim.Args(Path("x"), **{name: True}), HighFidelity(), "payload=5")
     assert (setting.noise, setting.latency) == (name == "noise", name == "latency")
+
+
+def test_the_json_names_a_schedule_not_its_path(random_policy, monkeypatch, tmp_path):
+    file = tmp_path / "hill.json"
+    file.write_text('[{"seconds": 3, "vx": 0.5}]')
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: random_policy)
+    monkeypatch.setattr(sim2sim, "sweeps", lambda args, policy, progress: {"nominal": []})
+    monkeypatch.setattr(sim2sim, "_show", lambda *args: None)
+    out = tmp_path / "out.json"
+    assert sim2sim.main(["p", "--schedule", str(file), "stop", "--json", str(out)]) == 0
+    assert json.loads(out.read_text())["schedule"] == ["hill", "stop"]
+    assert str(tmp_path) not in out.read_text()
+
+
+def test_what_a_robot_lacks_is_left_out_and_named():
+    tried = [condition for condition in perturbations.ALL if not condition.startswith("hands")]
+    said = perturbations.left_out(perturbations.ALL, tried)
+    assert said == "left out, because robot or engine lacks it: hands"
+    assert perturbations.left_out((), tried) == "" == perturbations.left_out(tried, tried)

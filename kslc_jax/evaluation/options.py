@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
-from kslc_jax.config import ConfigError
+from kslc_jax.config import XBOT_L, ConfigError
 from kslc_jax.errors import MissingPackage
 
 if TYPE_CHECKING:
@@ -46,10 +46,32 @@ def require_engine(engine: Engine, robot: "Robot") -> None:
         drake.require_hinged(robot)
 
 
-def check_trials(speeds: Sequence[float], seeds: int, seconds: float) -> None:
-    """ConfigError if the speeds [m/s], number or length [s] of the trials are out of range."""
-    if not (speeds and all(map(math.isfinite, speeds))):
+def speeds_for(
+    robot: str, wanted: tuple[float, ...] | None, xbot: tuple[float, ...]
+) -> tuple[float, ...]:
+    """Commanded speeds [m/s]: `wanted`, or if this is None XBot-L's, scaled to the robot's size.
+
+    `robot` is a shipped robot, or the path of a description.
+    """
+    if wanted is not None or robot == XBOT_L:
+        return xbot if wanted is None else wanted
+    from kslc_jax import robot as robot_lib
+    from kslc_jax import similar
+    from kslc_jax.evaluation.bars import scaled
+
+    factor = similar.factors(robot_lib.load(name=robot))[similar.SPEED]
+    return tuple(scaled(speed, factor) for speed in xbot)
+
+
+def check_speeds(speeds: Sequence[float] | None) -> None:
+    """ConfigError if there are no speeds, or one that is not finite."""
+    if speeds is not None and not (speeds and all(map(math.isfinite, speeds))):
         raise ConfigError("speeds: name at least one, finite")
+
+
+def check_trials(speeds: Sequence[float] | None, seeds: int, seconds: float) -> None:
+    """ConfigError if the speeds [m/s], number or length [s] of the trials are out of range."""
+    check_speeds(speeds)
     if seeds <= 0:
         raise ConfigError("seeds must be positive")
     if not (SHORTEST <= seconds <= LONGEST and seconds == round(seconds)):

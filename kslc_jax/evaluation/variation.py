@@ -39,7 +39,10 @@ class Body:
 
 
 def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
-    """The conditions that the robot can have, see `require`, with values that fit its size."""
+    """The conditions that the robot can have, see `require`, with values that fit its size.
+
+    `sole` counts for a robot at high fidelity only.
+    """
     factors = similar.factors(robot)
     return tuple(
         perturbations.scaled(condition, factors)
