@@ -403,8 +403,14 @@ def test_the_runner_repeats_the_golden_trace(setup, tmp_path):
     out.with_suffix(".json").write_text(json.dumps(contract.metadata(made)))
     np.savez(out.with_suffix(".npz"), **trace)
     check = runpy.run_path(str(EXAMPLES / "check_trace.py"))["first_difference"]
-    runner = runpy.run_path(str(EXAMPLES / "onnx_runner.py"))["Controller"]
-    assert check(runner, str(out), 1e-4) is None
+    runner = runpy.run_path(str(EXAMPLES / "onnx_runner.py"))
+    assert check(runner["Controller"], str(out), 1e-4) is None
+    model = mujoco.MjModel.from_xml_string(contract.mjcf(made))
+    model.opt.timestep = 0.001
+    track = runner["simulate"](runner["Controller"](str(out), 0.0), model, 0.2)
+    high = robot.load("high", name=BIPED)
+    assert len(track) == 21 and track[0, 2] == pytest.approx(high.default_qpos[2], abs=1e-5)
+    assert 0.5 * high.stand_height < track[-1, 2] < track[0, 2]  # it falls on its feet
 
 
 @pytest.mark.slow(reason="each robot compiles its own train step")

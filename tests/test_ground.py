@@ -192,6 +192,18 @@ class TestBothModels:
         np.testing.assert_allclose(forces(train, a), forces(high, b), atol=0.25 * weight)
         assert abs(forces(train, a).sum() - forces(high, b).sum()) < 0.3 * weight
 
+    @pytest.mark.slow(reason="compiles both models of another robot")
+    @pytest.mark.parametrize("kind", ["rough", "slope"])
+    def test_another_robot_stands_in_the_same_way(self, kind):
+        """For 0.25 s: then the biped, which has no policy, falls."""
+        train = PhysicsConfig(engine="mujoco", robot=BIPED, terrain=ALL)
+        high = HighFidelity(robot=BIPED, terrain=only(kind))
+        a, b = (standing(config, kind, FAR, 25) for config in (train, high))
+        np.testing.assert_allclose(a.qpos[:3], b.qpos[:3], atol=0.01)
+        weight = 9.81 * physics.robot_for(train).total_mass
+        for config, state in ((train, a), (high, b)):
+            assert 0.3 * weight < forces(config, state).sum() < 2.0 * weight
+
     def test_own_planes_of_flat_ground_are_the_floor(self):
         """At the start, where the ground is flat, every number is that of the model without it."""
         flat, uneven = PhysicsConfig(engine="mujoco"), PhysicsConfig(engine="mujoco", terrain=ALL)

@@ -520,6 +520,10 @@ SHOE = '<geom name="left_foot" type="box" size="0.08 0.03 0.01" pos="0.02 0 -0.0
 MASS = '<inertial pos="0 0 0" mass="0.4" diaginertia="0.001 0.001 0.001"/>'
 EQUALITY = '<equality><joint joint1="mast" joint2="port_cant"/></equality>\n  <actuator>'
 TENDON = '<tendon><fixed><joint joint="mast" coef="1"/></fixed></tendon>\n  <actuator>'
+BUOY = """<body name="buoy" pos="3 0 1">
+  <joint name="hinge" axis="0 1 0"/><geom size="0.1"/>
+</body></worldbody>"""
+MAST, NOD = '<joint name="mast" axis="0 0 1"/>', '<joint name="nod" axis="0 1 0"/>'
 ROBOTS = {
     "no free joint": ({"xml": ((FREE, ""), ("0 0 0.6 1 0 0 0", ""))}, "put <freejoint/>"),
     "slide": ({"xml": (('"mast" axis', '"mast" type="slide" axis'),)}, "joint 'mast' is no hinge"),
@@ -564,6 +568,30 @@ ROBOTS = {
         {"xml": (("0 0 0.6 1 0 0 0", "0 0 0.6 1 1 0 0"),)},
         "the base lies on its side",
     ),
+    "no pair of legs": (
+        {"toml": 'weld = ["cant", "sheet", "lock", "rudder"]\n', "front": True},
+        "found no pair of legs",
+    ),
+    "four pitch joints": (
+        {"xml": (('axis="1 0 0"', 'axis="0 1 0"'), ('axis="-1 0 0"', 'axis="0 1 0"'))},
+        "has 4 pitch joints (port_cant",
+    ),
+    "a joint elsewhere": (
+        {"xml": (("</worldbody>", BUOY), ("0 -0.2 -1 -0.5", "0 -0.2 -1 -0.5 0"))},
+        "joint 'hinge' is not on the robot",
+    ),
+    "half a body welded": (
+        {
+            "xml": ((MAST, MAST + NOD), ("0  0 -0.2 1", "0 0  0 -0.2 1")),
+            "toml": 'weld = ["nod"]\n',
+            "front": True,
+        },
+        "body 'crow' has several joints: weld all of them, or none",
+    ),
+    "tilted to the side": (
+        {"xml": ((SHOE, SHOE.replace("pos", 'quat="0.995 0.0998 0 0" pos')),)},
+        "or turn the foot's roll joint",
+    ),
     "prepared": (
         {"toml": 'prepared = true\nweld = ["mast"]\n', "front": True},
         "weld: not with prepared",
@@ -593,6 +621,36 @@ def test_menagerie_is_looked_for_in_order(tmp_path, monkeypatch):
     (tmp_path / "ship" / "biped.xml").write_text("<mujoco/>")
     monkeypatch.setenv(description.MENAGERIE_ROOT, str(tmp_path))
     assert description.read(str(path)).mjcf == tmp_path / "ship" / "biped.xml"
+
+
+def test_a_robot_of_menagerie_is_downloaded_and_what_fails_is_one_line(tmp_path, monkeypatch):
+    class MenagerieError(Exception):
+        """As the package has it."""
+
+    def get(name):
+        if name == "lost":
+            raise MenagerieError("no network:\ntry again")
+        return SimpleNamespace(path=lambda: tmp_path / name)
+
+    there = SimpleNamespace(get=get, MenagerieError=MenagerieError)
+    monkeypatch.setitem(sys.modules, "mujoco_menagerie", there)
+    known = {"mujoco_menagerie": tmp_path}
+    monkeypatch.setattr(description, "_package", known.get)
+    monkeypatch.delenv(description.MENAGERIE_ROOT, raising=False)
+    (tmp_path / "ship").mkdir()
+    (tmp_path / "ship" / "biped.xml").write_text("<mujoco/>")
+    path = tmp_path / "robot.toml"
+    path.write_text('mjcf = "menagerie:ship/biped.xml"')
+    assert description.read(str(path)).mjcf == tmp_path / "ship" / "biped.xml"
+    for inside, said in (
+        ("lost/biped.xml", "found no lost/biped.xml (no network: try again)"),
+        ("ship/other.xml", "found no ship/other.xml"),
+    ):
+        path = tmp_path / f"{inside[:4]}.toml"  # in another place: descriptions are cached
+        path.write_text(f'mjcf = "menagerie:{inside}"')
+        with pytest.raises(RobotError) as refused:
+            description.read(str(path))
+        assert str(refused.value).endswith(said)
 
 
 def test_mjcf_in_a_package(tmp_path):

@@ -285,6 +285,22 @@ def test_meshes_have_the_geoms_size_and_place():
         np.testing.assert_allclose(mesh.bounds.mean(0), model.geom_pos[geom], atol=1e-3)
 
 
+def test_a_mesh_keeps_its_size_and_place():
+    """As the links of other robots have it. MuJoCo moves a mesh's origin to its centre."""
+    shapes = pytest.importorskip(
+        "kslc_jax.viewer.shapes", reason="the extra 'viewer' is not installed"
+    )
+    spec = mujoco.MjSpec()
+    corners = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]])
+    faces = [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    spec.add_mesh(name="wedge", uservert=corners.flatten(), userface=np.ravel(faces))
+    body = spec.worldbody.add_body(pos=[0, 0, 1])
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="wedge", pos=[0.05, 0, 0])
+    mesh = shapes.mesh(spec.compile(), 0)
+    assert mesh.volume == pytest.approx(0.3 * 0.2 * 0.1 / 6, rel=1e-5)
+    np.testing.assert_allclose(mesh.bounds, [[0.05, 0, 0], [0.35, 0.2, 0.1]], atol=1e-6)
+
+
 @pytest.fixture(scope="module")
 def viewer(run_dir):
     """A viewer on a free port. It steps only when a test calls `frame`."""
