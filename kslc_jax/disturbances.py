@@ -1,4 +1,4 @@
-"""Disturbances of one episode: punches at links, and arms that somebody else moves."""
+"""Disturbances of one episode: punches at links, and arms that follow random targets."""
 
 import flax.struct
 import jax
