@@ -73,6 +73,7 @@ class Outcome:
     fast: jax.Array  # [] bool, settled and in the top part of the range, see is_fast
     top: jax.Array  # [] bool, the command is less than one `v_step` below v_max
     braking: jax.Array  # [] bool, such a command has ended within the last `falls_after` seconds
+    ends_command: jax.Array  # [] bool, a new command is drawn after this step
     commanded: jax.Array  # [] m/s, commanded vx
     speed: jax.Array  # [] m/s, vx of the base, base frame
     episode_steps: jax.Array  # [] int, age of the episode, see train_step.init
@@ -233,6 +234,7 @@ def _outcome(
         top=curriculum_lib.is_top(config.curriculum, curriculum, vx),
         braking=(before.time - before.top_until) * config.control_dt
         < config.curriculum.falls_after,
+        ends_command=time >= before.command_until,
         commanded=vx,
         speed=now.base_linvel[0],
         episode_steps=time,

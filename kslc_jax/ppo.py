@@ -96,7 +96,8 @@ def gae(
     A_t = delta_t + gamma lam (1 - done_t) A_{t+1}
 
     A time-out is not a failure. At a time-out, gamma V_t is added to r_t: it stands for
-    gamma V_{t+1}, because the state after the time-out is not kept (Humanoid-Gym).
+    gamma V_{t+1}, because the state after the time-out is not kept (Humanoid-Gym). With
+    `value_per_command` the same is done where a command ends.
 
     Args:
       reward, value, done, truncated: [T]; `done` is terminated or truncated.

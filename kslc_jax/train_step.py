@@ -141,9 +141,12 @@ def step_keys(state: TrainState) -> jax.Array:
 def samples_of(config: Config, traj: Trajectory, last_value: jax.Array) -> Samples:
     """PPO samples [T * N, ...] of a trajectory, with advantages; `last_value` is [N]."""
     out = traj.outcome
-    done = out.terminated | out.truncated
+    cut = out.truncated
+    if config.ppo.value_per_command:
+        cut = cut | (out.ends_command & ~out.terminated)
+    done = out.terminated | cut
     advantage, target = jax.vmap(ppo.gae, (1, 1, 0, 1, 1, None, None), 1)(
-        out.reward, traj.value, last_value, done, out.truncated, config.ppo.gamma, config.ppo.lam
+        out.reward, traj.value, last_value, done, cut, config.ppo.gamma, config.ppo.lam
     )
     samples = Samples(
         index=jnp.arange(config.batch_size).reshape(traj.value.shape),

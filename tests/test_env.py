@@ -191,6 +191,17 @@ def test_tracking_settles_two_seconds_after_a_new_command(setting):
         assert bool(outcome.settled) == settled, time
 
 
+def test_a_command_ends_where_the_next_state_has_a_new_one(setting):
+    """The outcome says so before the new command is drawn: its reward is still the old one's."""
+    _, reset, step = setting
+    state = reset(jax.random.key(3)).replace(command_until=jnp.int32(7), time=jnp.int32(5))
+    now, outcome = step(state, jnp.zeros(16), jax.random.key(4))
+    assert not outcome.ends_command and int(now.command_until) == 7
+    then, outcome = step(now, jnp.zeros(16), jax.random.key(5))
+    assert outcome.ends_command and int(then.command_until) > 7 == int(then.command_since)
+    assert not np.array_equal(then.command.heading, now.command.heading)
+
+
 def test_a_robot_brakes_for_four_seconds_after_its_last_command_at_the_top(setting):
     """The range ends at 0.5 m/s: a command of 0.3 m/s is at its top, and one of -0.2 is not."""
     config, reset, step = setting

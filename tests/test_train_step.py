@@ -205,6 +205,34 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     assert not np.array_equal(*keys)
 
 
+@pytest.mark.parametrize("per_command", [True, False])
+def test_a_new_command_ends_the_sum_of_rewards(made, per_command):
+    """By hand, for rewards of 1, a value of 10, gamma 0.994 and lambda 0.9. The value after the new
+    command is 99: a value per command does not see it. A fall in the same step earns nothing."""
+    config, *_ = made
+    ppo = dataclasses.replace(config.ppo, value_per_command=per_command, rollout_steps=2)
+    config = dataclasses.replace(config, ppo=ppo, env=dataclasses.replace(config.env, num_envs=2))
+    no, blank = jnp.zeros((2, 2), bool), jnp.zeros((2, 2))
+    out = env.Outcome(**dict.fromkeys(env.Outcome.__dataclass_fields__, no)).replace(
+        reward=blank + 1.0,
+        ends_command=no.at[1].set(True),
+        terminated=no.at[1, 1].set(True),
+    )
+    names = rollout.Trajectory.__dataclass_fields__
+    traj = rollout.Trajectory(**dict.fromkeys(names, blank)).replace(
+        value=blank + 10.0, outcome=out
+    )
+    samples = train_step.samples_of(config, traj, jnp.array([99.0, 99.0]))
+    goes_on = 1.0 + 0.994 * (10.0 if per_command else 99.0) - 10.0
+    falls = 1.0 - 10.0
+    before = 1.0 + 0.994 * 10.0 - 10.0
+    found = samples.advantage.reshape(2, 2)
+    np.testing.assert_allclose(found[1], [goes_on, falls], rtol=1e-5)
+    np.testing.assert_allclose(
+        found[0], before + 0.994 * 0.9 * np.array([goes_on, falls]), rtol=1e-5
+    )
+
+
 def test_robots_start_unlike_each_other(made):
     env = made[1]().env
     assert len(np.unique(env.dynamics.friction)) == len(np.unique(env.time)) == 16

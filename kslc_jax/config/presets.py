@@ -53,7 +53,7 @@ _LAPTOP = _override(
     _override(_PAPER, **_LAPTOP_LEARNER),
     env={"critic_memory": True},
     network={"estimator": (128, 64)},
-    ppo={"entropy_fades": True, "average": 0.98},
+    ppo={"entropy_fades": True, "average": 0.98, "value_per_command": True},
     command={
         "shortest_seconds": 1.0,
         "acceleration": 3.0,
@@ -114,7 +114,7 @@ _LAPTOP = _override(
         "knee_distance": (0.17, 0.25),
         "lean_per_speed": 0.03,
         "exact_full": 2.0,
-        "restless": 0.6,
+        "restless": 0.3,
         "shuffle": 2.0,
         "weights": {
             "feet_contact_number": 2.0,
