@@ -184,9 +184,10 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     value, advantage = samples.value.reshape(-1, n), samples.advantage.reshape(-1, n)
     last = np.asarray(networks.value(config, new.learner.params, new.env.privileged_history))
     assert out.broken.sum() == 1 and np.array_equal(samples.valid, ~out.broken.ravel())
-    following, done = np.r_[value[1:], last[None]], out.terminated | out.truncated
     assert out.truncated.sum() == n // 2 - 1 and 0 < out.fast.sum() < out.settled.sum()
-    delta = out.reward + 0.994 * np.where(out.truncated, value, following * ~done) - value
+    cut = out.truncated | (out.ends_command & ~out.terminated)
+    following, done = np.r_[value[1:], last[None]], out.terminated | cut
+    delta = out.reward + 0.994 * np.where(cut, value, following * ~done) - value
     trace = np.zeros(n)
     for t in reversed(range(len(value))):
         trace = delta[t] + 0.994 * 0.9 * ~done[t] * trace
@@ -194,7 +195,7 @@ def test_what_update_and_curriculum_are_given(made, monkeypatch):
     for name, x, mask in (
         ("tracking", out.terms["tracking_lin_vel"], out.settled),
         ("fast_tracking", out.terms["tracking_lin_vel"], out.fast),
-        ("episode_steps", out.episode_steps, done),
+        ("episode_steps", out.episode_steps, out.terminated | out.truncated),
         ("gait", out.terms["feet_contact_number"], out.fast),
     ):
         average = float(getattr(new.curriculum, name))
@@ -248,7 +249,8 @@ def test_samples_whose_costs_exceed_what_they_earn_are_counted(made):
         broken=jnp.arange(6) == 5,
         terms={"tracking_lin_vel": blank, "feet_contact_number": blank},
         **dict.fromkeys(
-            ("settled", "fast", "top", "braking", "terminated", "truncated"), blank > 0
+            ("settled", "fast", "top", "braking", "ends_command", "terminated", "truncated"),
+            blank > 0,
         ),
     )
     progress = train_step.progress_of(config, out)
@@ -272,6 +274,7 @@ def test_slow_commands_at_the_top_count_as_if_they_were_faster():
         fast=no,
         top=jnp.array([True, True, True, False, False, False]),
         braking=jnp.array([False, False, False, False, True, True]),
+        ends_command=no,
         commanded=jnp.array([0.5, 4.0, 4.0, 1.0, 0.0, 0.0]),
         speed=jnp.array([0.4, 4.3, 0.0, 0.0, 0.0, 0.0]),
         episode_steps=jnp.zeros(6, int),
