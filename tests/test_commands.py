@@ -149,8 +149,8 @@ def test_a_share_of_the_commands_is_slow():
 
 @pytest.mark.parametrize(("before", "share"), [(3.0, 0.4), (1.5, 0.0)])
 def test_fast_commands_are_followed_by_stops_and_reversals(before, share):
-    """Of those above half of the range, 3.5 m/s, two fifths: half stand, half go back at -0.3 m/s.
-    They go straight."""
+    """The range ends at 3.5 m/s. After a command above half of it, two fifths of the next commands
+    brake: one half of these means "stand", the other half goes back at -0.3 m/s, straight."""
     config = dataclasses.replace(PAPER, dead_zone=0.0, brake_fraction=0.4)
     drawn = draw_many(config, before=make_command(velocity=[before, 0.0, 0.0]))
     vx, vy, _ = np.asarray(drawn.velocity).T

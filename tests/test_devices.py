@@ -1,7 +1,7 @@
 """A training on several devices or processes gives the numbers of one device.
 
-XLA reads the number of CPU devices only when it starts. Most of these tests therefore run in child
-processes. A child runs this file as a script, and calls the function that its command line names.
+XLA reads the number of CPU devices only when it starts. Most of these tests therefore run in other
+processes. Each runs this file as a script, and calls the function that its command line names.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ STEPS = 3
 MJX = dataclasses.replace(preset("debug"), physics=physics.PhysicsConfig(engine="mjx"))
 
 
-# -------------------------------------------------------------------------------- in the children
+# -------------------------------------------------------------------------------- in the processes
 
 
 def glide(config, state, target, dynamics, ground_friction):

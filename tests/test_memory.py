@@ -44,8 +44,8 @@ def test_rollout():
     mjx = dataclasses.replace(PAPER, physics=physics)
     mujoco = dataclasses.replace(PAPER, physics=dataclasses.replace(PAPER.physics, engine="mujoco"))
     terms = len(dataclasses.fields(PAPER.rewards.weights))
-    # action, mean, log_prob, value, age, frames; reward, terms, two speeds, episode_steps, 8 flags
-    trajectory = 4096 * 60 * (4 * (16 + 16 + 3 + 59 + 89 + 1 + terms + 2 + 1) + 8)
+    # action, mean, log_prob, value, age, frames; reward, terms, two speeds, episode_steps, 9 flags
+    trajectory = 4096 * 60 * (4 * (16 + 16 + 3 + 59 + 89 + 1 + terms + 2 + 1) + 9)
     _, shape, _ = memory.shapes(PAPER)
     assert memory._rollout(mujoco, shape, 1e6, 1) == trajectory + 3e6
     assert memory._rollout(mjx, shape, 1e6, 1) == trajectory + 3e6 + 4096 * 25 * 1024

@@ -26,7 +26,7 @@ BATCH = preset("debug").batch_size
 
 SLOW = pytest.mark.slow(reason="starts Python four times")
 
-# -------------------------------------------------------------------------------- in the children
+# -------------------------------------------------------------------------------- in the processes
 
 
 def filled(like):
@@ -95,8 +95,8 @@ def two(tmp_path_factory):
     """A training of three train steps by two processes with two devices each, and their output."""
     run_dir = tmp_path_factory.mktemp("two") / "r"
     with contextlib.ExitStack() as stack:
-        children = started(stack, *COUNT, *DEBUG, *ON, 3 * BATCH, "--run-dir", run_dir)
-        return run_dir, ended(children)
+        processes = started(stack, *COUNT, *DEBUG, *ON, 3 * BATCH, "--run-dir", run_dir)
+        return run_dir, ended(processes)
 
 
 @SLOW
@@ -135,10 +135,10 @@ def test_no_number_changes_with_the_number_of_devices(two, tmp_path):
 def test_a_signal_to_one_process_stops_all(tmp_path):
     run_dir = tmp_path / "r"
     with contextlib.ExitStack() as stack:
-        children = started(stack, *COUNT, *DEBUG, "--steps", 10**7, "--run-dir", run_dir)
-        wait_for_rows(run_dir, 3, children)
-        children[1].send_signal(signal.SIGTERM)
-        (first, _), _ = ended(children)
+        processes = started(stack, *COUNT, *DEBUG, "--steps", 10**7, "--run-dir", run_dir)
+        wait_for_rows(run_dir, 3, processes)
+        processes[1].send_signal(signal.SIGTERM)
+        (first, _), _ = ended(processes)
     last = rows(run_dir)[-1]["step"]
     assert f"stopped by a signal to another process at train step {last}, saved" in first
     assert stored(run_dir)[0] == last
@@ -183,11 +183,11 @@ def test_the_death_of_one_process_ends_the_other(tmp_path, lost):
     """Afterwards the run folder is unlocked, and its checkpoint is readable."""
     run_dir = tmp_path / "r"
     with contextlib.ExitStack() as stack:
-        children = started(stack, *COUNT, *DEBUG, "--steps", 10**7, "--run-dir", run_dir)
-        wait_for_rows(run_dir, 3, children)
-        children[lost].kill()
-        children[1 - lost].communicate(timeout=1500)
-        assert children[1 - lost].returncode != 0
+        processes = started(stack, *COUNT, *DEBUG, "--steps", 10**7, "--run-dir", run_dir)
+        wait_for_rows(run_dir, 3, processes)
+        processes[lost].kill()
+        processes[1 - lost].communicate(timeout=1500)
+        assert processes[1 - lost].returncode != 0
     assert stored(run_dir)[0] >= 1
     with run_folder.locked(run_dir):
         pass

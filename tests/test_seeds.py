@@ -274,7 +274,7 @@ def test_seeds_do_not_hide_in_the_folder_of_a_run(training, capsys):
 
 def test_more_seeds_than_memory(training, capsys):
     assert training(lambda state: state, "--seeds", "1e9") == 2
-    assert "error: --seeds, env.num_envs, " in capsys.readouterr().err
+    assert "GiB: lower --seeds, env.num_envs, " in capsys.readouterr().err
     assert not training.dir.exists()
 
 

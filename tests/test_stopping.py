@@ -24,7 +24,7 @@ def test_first_signal_asks_second_interrupts():
     with stopping.stop_requests() as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop.requested == "SIGINT"
-        signal.raise_signal(signal.SIGTERM)  # the same wish, come by another way
+        signal.raise_signal(signal.SIGTERM)  # a second request within a second counts as the same
         assert stop.requested == "SIGINT"
         stop._since -= stopping.SAME_SIGNAL_SECONDS
         with pytest.raises(KeyboardInterrupt):

@@ -209,7 +209,7 @@ def test_arms_momentum_is_theirs_alone(xbot):
 
 
 def test_sweep_and_table(still):
-    """Of four robots at high fidelity, like the trials of the servos: the same program."""
+    """Four robots at high fidelity: the tests of the servos have compiled this program already."""
     args = evaluate.Args("still", speeds=(0.0, 1.0), seeds=2, seconds=3.0, fidelity="high")
     rows = evaluate.sweep(args, still)
     assert [r["command"] for r in rows] == [0.0, 1.0]

@@ -43,7 +43,7 @@ def inverse_inertia(model: mujoco.MjModel) -> np.ndarray:
 
 
 def test_heavier_hands_are_point_masses_at_the_hands():
-    """As MuJoCo has it with two more bodies."""
+    """The mass matrix equals MuJoCo's for a model with two more bodies, one at each hand."""
     spec = mujoco.MjSpec.from_file(str(description.read(XBOT_L).mjcf))
     hands = robot.load("high").mj_model
     for side in ("left", "right"):
