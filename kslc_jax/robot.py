@@ -78,7 +78,10 @@ class Robot:
 
     @property
     def foot_shapes(self) -> tuple[np.ndarray, ...]:
-        """Geoms of the left and of the right foot that collide; at high fidelity its own shapes."""
+        """Ids of the geoms that collide, of the left and of the right foot.
+
+        At high fidelity they are the foot's own shapes, in training its sole spheres, too.
+        """
         model = self.mj_model
         colliding = (model.geom_contype | model.geom_conaffinity) > 0
         left, right = self.anatomy.feet

@@ -164,7 +164,7 @@ def _read_as(text: str, like: Value) -> Value:
     if isinstance(like, int | float):
         with contextlib.suppress(ValueError):
             return type(like)(text)
-    return text
+    return like if text == str(like) else text
 
 
 def affine_cpus() -> int:
