@@ -106,7 +106,8 @@ def _answer(part: Part, plan: Plan, left: float, cache: str) -> Numbers:
     if part == "exact":
         return _both(child)
     if part == "large" and plan.train:
-        after = BRAX_SECONDS if "brax" in plan.parts and _installed("brax") else 0.0
+        comes = "brax" in plan.parts[plan.parts.index("large") :] and _installed("brax")
+        after = BRAX_SECONDS if comes else 0.0
         return child(part, **{"train-seconds": max(left - after, 1.0)})
     return child(part)
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from kslc_jax import runtime
 from kslc_jax.config import Config
 
 Seconds = dict[str, list[float]]
@@ -78,7 +79,7 @@ def machine() -> dict[str, Any]:
     import mujoco
 
     return {
-        "cpu": _cpu_model(),
+        "cpu": runtime.cpu_model(),
         "cores": os.cpu_count(),
         "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30),
         "device": jax.devices()[0].device_kind,
@@ -87,13 +88,6 @@ def machine() -> dict[str, Any]:
         "jax": jax.__version__,
         "mujoco": mujoco.__version__,
     }
-
-
-def _cpu_model() -> str:
-    path = Path("/proc/cpuinfo")
-    lines = path.read_text().splitlines() if path.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
 
 
 def report(result: dict[str, Any], path: Path | None) -> None:

@@ -101,7 +101,7 @@ def _message(box: str) -> str:
 
 
 def run(do: Callable[[], int | None], needs_output: bool = True) -> int:
-    """Runs a command; returns its exit code. Afterwards a notebook's process is as before.
+    """Runs a command; returns its exit code. Afterwards hooks and options are those of before.
 
     Args:
       do: does the command's work; returns its exit code, None for 0. A UserError prints one line

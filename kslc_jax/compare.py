@@ -28,17 +28,13 @@ from rich.table import Table
 from kslc_jax import cli, evaluate, files, records, train
 from kslc_jax import config as config_lib
 from kslc_jax.config import XBOT_L, Config, ConfigError, Fidelity
-from kslc_jax.evaluation import options
+from kslc_jax.evaluation import options, tables
 from kslc_jax.training import stopping
 
 WIDTH = 200
 """Width of the table in characters, independent of the terminal: no line may break."""
 
 VARIANTS = ("kslc", "baseline", *(f"no-{part}" for part in config_lib.ABLATIONS))
-
-
-SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-"""Commanded speeds [m/s] of XBot-L, if none are given."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +111,7 @@ def jobs(args: Args) -> Iterator[Job]:
 
 def _commanded(args: Args) -> tuple[float, ...]:
     """The speeds of the evaluation [m/s]."""
-    return options.speeds_for(args.robot, args.speeds, SPEEDS)
+    return options.speeds_for(args.robot, args.speeds, options.SPEEDS)
 
 
 def _job(args: Args, variant: str, ablation: str | None, seed: int) -> Job:
@@ -252,7 +248,7 @@ def table(runs: Sequence[Path]) -> Table:
     results = {run: _speeds(run) for run in runs}
     commands = sorted({command for speeds in results.values() for command in speeds})
     for command in commands:
-        shown.add_column(f"{command:.1f}", justify="right")
+        shown.add_column(tables.speed(command), justify="right")
     for run, speeds in results.items():
         shown.add_row(run.name, *_reached(run), *(speeds.get(v, "-") for v in commands))
     return shown

@@ -30,9 +30,7 @@ class GaitState:
     air_time: jax.Array  # [2] s in the air, 0 if grounded (see `update`)
     landed_air_time: jax.Array  # [2] s, air time that ended at this step, else 0
     swing_height: jax.Array  # [2] m above the last contact
-    mean_error: (
-        jax.Array
-    )  # [2] m/s, mean of vx, vy minus the command over about a cycle, base frame
+    mean_error: jax.Array  # [2] m/s, mean error of vx, vy over about a cycle, base frame
     stance: jax.Array  # [2] bool, True: the clock wants this foot on the ground
     clock: jax.Array  # [2] sin and cos of the phase; (0, 0) while standing still
 

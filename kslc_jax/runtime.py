@@ -95,8 +95,8 @@ def prepare(gl: bool = True) -> None:
 
     It makes XLA quiet, and sets a persistent compilation cache and the number of threads that this
     process may use. With `gl` it also chooses the library that draws off screen. Variables that the
-    user has set stay. The exceptions are those that change numbers (`NUMERICS`): it removes them,
-    with a warning on stderr.
+    user has set stay. The exceptions are those of `NUMERICS`: it removes them, with a
+    warning on stderr.
     """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if folder := cache_dir():
@@ -104,7 +104,10 @@ def prepare(gl: bool = True) -> None:
     if usable_cpus() < affine_cpus():
         os.environ.setdefault(XLA_THREADS, str(usable_cpus()))
     if others := fix_numerics():
-        print(f"warning: {', '.join(others)} ignored: numbers would change", file=sys.stderr)
+        print(
+            f"warning: {', '.join(others)} ignored: numbers would change, or errors come",
+            file=sys.stderr,
+        )
     if gl:
         choose_gl()
 
@@ -255,7 +258,8 @@ LOG_LEVELS = {
 def is_program() -> bool:
     """True if this process runs a command of this package only, as python -m kslc_jax.train does.
 
-    False in a notebook, or in a program that calls the command.
+    False in a notebook, or in a program that calls the command. The modules of `benchmarks` count
+    as commands.
     """
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     return spec is not None and spec.name.partition(".")[0] in ("kslc_jax", "benchmarks")

@@ -61,9 +61,6 @@ MOST_LATENCY = 50
 """Largest delay of the actions [control steps]."""
 
 
-SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
-"""Commanded speeds [m/s] of XBot-L, if none are given."""
-
 MUJOCO_ONLY = ("variation", "terrain", "punch")
 """Changes of `perturbations.changes` that Drake does not have."""
 
@@ -111,8 +108,8 @@ class Args:
     up and down), slope:DEGREES (a plane), stairs:M (steps of M metres). Each robot draws the
     direction. The first 0.5 m are flat."""
     perturb: tuple[str, ...] = ()
-    """Repeat the trials with each of these: friction=MU, payload=KG on the base, com=M (shift of
-    the base's centre of mass forwards, to the left and up), push=M/S (largest push along x and y,
+    """Repeat the trials with each of these: friction=MU, payload=KG on the trunk, com=M (shift
+    of the trunk's centre of mass along each of its axes), push=M/S (largest push along x and y,
     every 4 s), gains=FACTOR on kp and kd, strength=FACTOR on the motors' torque, imu=RAD (constant
     error of roll and pitch), links=SHARE (largest change of each link's mass), hands=KG at each
     hand, sole=M (largest distance of a sole's sides from the foot's outline), joints=X (each joint
@@ -213,7 +210,7 @@ def _rows(
         plans = [schedules.named(n, policy.config, v_max, args.top) for n in args.schedule]
         return scheduled.measure(policy, conditions, plans, args.seeds, args.seed, progress)
     vy, yaw_rate = args.sideways, args.turn
-    speeds = options.speeds_for(policy.config.physics.robot, args.speeds, SPEEDS)
+    speeds = options.speeds_for(policy.config.physics.robot, args.speeds, options.SPEEDS)
     rows = measure(
         policy, conditions, speeds, args.seeds, args.seed, progress, vy=vy, yaw_rate=yaw_rate
     )
@@ -227,7 +224,7 @@ def summary(results: Results, title: str) -> Table:
     out = Table(title=title, title_justify="left")
     out.add_column(escape("survived, mean vx [m/s]"))
     for row in results["nominal"]:
-        out.add_column(f"{row['command']:.1f}", justify="right")
+        out.add_column(tables.speed(row["command"]), justify="right")
     for condition, rows in results.items():
         cells = [
             f"{row['survival']:.0%} {row['forward_mean']:.2f}" + "*" * ("beyond" in row)

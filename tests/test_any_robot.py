@@ -472,6 +472,15 @@ def test_starting_from_another_robots_policy_names_the_numbers(mine, untrained, 
         starting.from_policy(tmp_path / "policy", setup, init, LocalStorage(), None)
 
 
+def test_starting_from_a_policy_of_another_control_step_says_so(setup, untrained, tmp_path):
+    policy.save_policy(untrained, tmp_path / "policy")
+    slower = dataclasses.replace(setup.physics, decimation=2 * setup.physics.decimation)
+    init, _ = train_step.make(setup)
+    with pytest.warns(UserWarning, match=r"control step of 0.01 s, this training one of 0.02 s"):
+        other = dataclasses.replace(setup, physics=slower)
+        starting.from_policy(tmp_path / "policy", other, init, LocalStorage(), None)
+
+
 def test_legs_may_have_neither_roll_nor_yaw(biped, setup):
     """The term of these joints then asks for nothing of them: 1 - 0.01 |q|."""
     roles = biped.anatomy.roles
@@ -539,37 +548,30 @@ def test_a_robot_is_tried_under_what_it_can_have():
 
 
 def test_the_soles_of_a_turned_foot_wander_inside_it():
-    """The biped's right foot is turned by half a turn. It keeps within the sole's outline."""
+    """The box of the left foot is turned by 0.5 rad in its link, that of the right by half a turn.
+
+    In the frame of the described box, the new one lies within its outline.
+    """
     high = robot.load("high", name=BIPED)
-    nominal = randomize.model_fields(high, randomize.nominal(high), 1.0)
-    plain, left_right = high.mj_model, [int(foot[0]) for foot in high.foot_shapes]
-
-    def corners(model):
-        data = mujoco.MjData(model)
-        data.qpos[:] = high.default_qpos
-        mujoco.mj_kinematics(model, data)
-        signs = np.array([[x, y, -1] for x in (-1, 1) for y in (-1, 1)])
-        return np.stack(
-            [
-                data.geom_xpos[foot]
-                + (signs * model.geom_size[foot]) @ data.geom_xmat[foot].reshape(3, 3).T
-                for foot in left_right
-            ]
-        )
-
-    outline = corners(plain)
+    plain, feet = copy.copy(high.mj_model), [int(foot[0]) for foot in high.foot_shapes]
+    plain.geom_quat[feet] = [[np.cos(0.25), 0, 0, np.sin(0.25)], [0, 0, 0, 1]]
+    turned = dataclasses.replace(high, mj_model=plain)
+    assert variation._foot_boxes(turned) == tuple(feet)
+    nominal = {"geom_pos": jnp.asarray(plain.geom_pos)}
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     for seed in range(5):
-        fields = variation._soles(0.02, high, jax.random.key(seed), nominal)
-        model = copy.copy(plain)
-        for name, value in fields.items():
-            getattr(model, name)[:] = np.asarray(value)
-        sole = corners(model)
-        for foot in range(2):
-            lower, upper = outline[foot].min(axis=0), outline[foot].max(axis=0)
-            inside = (sole[foot] >= lower - 1e-3) & (sole[foot] <= upper + 1e-3)
-            assert inside.all()
-            moved = np.abs(sole[foot] - outline[foot])[:, :2]
-            assert 1e-3 < moved.max() <= 0.02 + 1e-3
+        fields = variation._soles(0.02, turned, jax.random.key(seed), nominal)
+        for foot in feet:
+            frames = np.zeros((2, 9))
+            mujoco.mju_quat2Mat(frames[0], plain.geom_quat[foot])
+            mujoco.mju_quat2Mat(frames[1], np.asarray(fields["geom_quat"][foot], float))
+            described, new = frames.reshape(2, 3, 3)
+            size = np.asarray(fields["geom_size"][foot])
+            corners = fields["geom_pos"][foot] - plain.geom_pos[foot] + (signs * size) @ new.T
+            inside = np.abs(corners @ described)
+            assert (inside <= plain.geom_size[foot] + 1e-3).all()
+            assert (plain.geom_size[foot] - size)[:2].max() > 1e-3
+            assert 1.0 - variation.TILT < new[2, 2] < 1.0  # tilted a little
 
 
 @pytest.mark.slow(reason="compiles a trial for each of sixteen conditions: minutes")

@@ -160,11 +160,7 @@ def test_a_command_silences_its_process(process, monkeypatch):
     assert hooks() == inside[0]
 
 
-IS_PROGRAM = """
-import sys
-from kslc_jax import doctor, runtime
-sys.exit(not runtime.is_program())
-"""
+IS_PROGRAM = "from kslc_jax import runtime; print(runtime.is_program())"
 
 
 @pytest.mark.parametrize("how", ["module", "code"])
@@ -172,12 +168,14 @@ def test_a_program_is_a_command_of_this_package(how, tmp_path):
     if how == "module":
         folder = tmp_path / "benchmarks"
         folder.mkdir()
+        (folder / "__init__.py").touch()
         (folder / "one.py").write_text(IS_PROGRAM)
         words = ["-m", "benchmarks.one"]
     else:
         words = ["-c", IS_PROGRAM]
-    done = subprocess.run([sys.executable, *words], cwd=tmp_path, check=False)
-    assert done.returncode == (0 if how == "module" else 1)
+    argv = [sys.executable, *words]
+    done = subprocess.run(argv, cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert done.stdout == f"{how == 'module'}\n"
 
 
 @pytest.mark.parametrize(
@@ -386,6 +384,13 @@ def cgroup(root, groups: str, **files: str) -> None:
 def test_the_quota_of_cpus(tmp_path, groups, files, quota):
     cgroup(tmp_path, groups, **files)
     assert runtime.cpu_quota(tmp_path) == quota
+
+
+def test_the_processor_and_its_vector_instructions(tmp_path):
+    path = tmp_path / "cpuinfo"
+    path.write_text("processor\t: 0\nmodel name\t: A CPU\nflags\t\t: fpu avx avx2 sse\n\nother\n")
+    assert runtime.cpu_model(path) == "A CPU, avx2"
+    assert "," not in runtime.cpu_model(tmp_path / "none")
 
 
 def test_a_machine_without_control_groups(tmp_path):

@@ -206,6 +206,36 @@ def test_servos_alone_stand_a_second_in_drake():
     assert 0.8 < trace.qpos[50, 0, 2] < 0.9
 
 
+def test_a_foot_of_several_shapes_carries_the_weight(tmp_path):
+    """The left foot has two boxes side by side, the right one a mesh of the same outline."""
+    xml = Path(BIPED).with_suffix(".xml").read_text()
+    half = '<geom type="box" size="0.08 0.015 0.01" pos="0.02 {y} -0.03"/>'
+    left = '<geom name="left_foot" type="box" size="0.08 0.03 0.01" pos="0.02 0 -0.03"/>'
+    right = '<geom type="box" size="0.08 0.03 0.01" pos="-0.02 0 -0.03"/>'
+    corners = [f"{x} {y} {z}" for x in (-0.08, 0.08) for y in (-0.03, 0.03) for z in (-0.01, 0.01)]
+    mesh = f'<asset><mesh name="shoe" vertex="{" ".join(corners)}"/></asset>'
+    assert left in xml and right in xml
+    xml = xml.replace(left, half.format(y=0.015) + half.format(y=-0.015))
+    xml = xml.replace(right, '<geom type="mesh" mesh="shoe" pos="-0.02 0 -0.03"/>')
+    (tmp_path / "biped.xml").write_text(xml.replace("<worldbody>", mesh + "<worldbody>"))
+    shutil.copy(BIPED, tmp_path)
+    config = HighFidelity(robot=str(tmp_path / "biped.toml"))
+    other = world_of(config)
+    assert [len(foot) for foot in other.feet] == [2, 1]
+    qpos = other.robot.default_qpos.copy()
+    qpos[2] = other.robot.stand_height + 0.002
+    state = physics.initial_state(config, jnp.asarray(qpos), jnp.zeros(6 + other.robot.count))
+    state = jax.tree.map(lambda x: np.asarray(x, np.float64), state).replace(qpos=qpos)
+    touch, loads = [other.robot.sensor(name).start for name in drake.TOUCH_SENSORS], []
+    for _ in range(20):
+        args = qpos[7:], nominal_of(other.robot), config.decimation
+        state = drake.advance(other, state, *args)
+        loads.append(state.sensordata[touch])
+    weight = 9.81 * other.robot.total_mass
+    both = np.mean(loads[8:], axis=0)
+    assert both.sum() == pytest.approx(weight, rel=0.15) and both.min() > 0.3 * weight
+
+
 def test_two_joints_in_one_body_are_refused():
     spec = build.spec(description.read(BIPED), "high")
     name = spec.body("port_keel").name

@@ -617,6 +617,7 @@ class TestResume:
         first = json.loads(path.read_text())
         assert first["engine"] == "mujoco" and first["devices"] == 1
         old = first | {"jax": "0.8.0", "python": "3.10.1", "engine": "mjx", "devices": 4}
+        old |= {"cpu": "another", "XLA_FLAGS": ""}
         path.write_text(json.dumps(old))
         line = done("--steps", 1152).splitlines()[0]
         assert line.startswith("resuming with ") and "(bits may differ from here)" in line
@@ -625,12 +626,14 @@ class TestResume:
             f"python {first['python']} instead of 3.10.1",
             "engine mujoco instead of mjx",
             "devices 1 instead of 4",
+            f"cpu {first['cpu']} instead of another",
+            f"XLA_FLAGS {first['XLA_FLAGS']} instead of none",
         ):
             assert said in line
         kept = json.loads(path.read_text())
         (news,) = kept.pop("resumed")
         assert kept == old
-        changed = ("jax", "python", "engine", "devices")
+        changed = ("jax", "python", "engine", "devices", "cpu", "XLA_FLAGS")
         assert news == {"train_step": 8} | {name: first[name] for name in changed}
         assert done("--steps", 1280).startswith("resuming: ")  # as the last time
         assert len(json.loads(path.read_text())["resumed"]) == 1

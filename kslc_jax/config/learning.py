@@ -123,8 +123,9 @@ class PPOConfig:
     """Lambda of generalised advantage estimation (GAE)."""
     value_per_command: bool = False
     """True: the value of a state is that of holding its present command for ever. A new command
-    then ends the sum of rewards, as a time-out does. New commands are random, so what they change
-    is noise to the policy. False: the value expects new commands (HG)."""
+    then ends the sum of rewards, as a time-out does. Which command comes is random, and is noise to
+    the policy. But it is not paid either for being ready for the next one. False: the value expects
+    new commands (HG)."""
     clip: float = 0.2
     """Clipping of the probability ratio and of the change of the value."""
     value_coef: float = 1.0

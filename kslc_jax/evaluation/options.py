@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 Engine = Literal["mujoco", "drake"]
 """Simulators of a trial at high fidelity."""
 
+SPEEDS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+"""Commanded speeds [m/s] of XBot-L, if none are given."""
+
 SHORTEST = 3.0
 """Shortest trial [s]. Some time must remain after the robot has gathered speed."""
 

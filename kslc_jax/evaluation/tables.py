@@ -1,5 +1,6 @@
 """Prints metrics as tables. Imports no JAX."""
 
+import math
 import sys
 from collections.abc import Sequence
 
@@ -39,6 +40,11 @@ SIDEWAYS_COLUMNS: Columns = (
 """Columns for commands with a side step or a turn. They add mean vy and mean yaw rate."""
 
 
+def speed(command: float) -> str:
+    """A commanded speed [m/s] with one digit, or with as many as it has: 0.5, 0.45."""
+    return f"{command:.1f}" if math.isclose(command, round(command, 1)) else f"{command:g}"
+
+
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
     """A table with one line per commanded speed. An asterisk marks rows with the entry `beyond`."""
     marked = any("beyond" in row for row in rows)
@@ -48,7 +54,7 @@ def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table
         out.add_column(escape(label), justify="right")  # rich would read [m/s] as a style
     for row in rows:
         cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
-        out.add_row(f"{row['command']:.1f}" + "*" * ("beyond" in row), *cells)
+        out.add_row(speed(row["command"]) + "*" * ("beyond" in row), *cells)
     return out
 
 

@@ -60,7 +60,7 @@ def join(
     try:
         jax.distributed.initialize(coordinator, processes, index)
     except (RuntimeError, ValueError, OSError) as error:
-        by = f"{coordinator}" if coordinator else "auto, with the scheduler's settings"
+        by = coordinator or "auto, with the scheduler's settings"
         why = first_line(error)
         raise ConfigError(f"--coordinator {by}: cannot join the processes: {why}") from error
 

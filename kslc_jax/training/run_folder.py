@@ -44,7 +44,6 @@ def versions() -> dict[str, str | int]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpu": runtime.cpu_model(),
-        "threads": runtime.usable_cpus(),
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         "device": str(jax.devices()[0].device_kind),
         "kslc_jax": __version__,
@@ -183,7 +182,7 @@ def what_changed(run_dir: Path, facts: dict[str, Any]) -> str:
     """A short description of the differences since the training last ran; empty without any."""
     before = _last_known(run_dir)
     changed = [
-        f"{name} {now} instead of {before[name]}"
+        f"{name} {now or 'none'} instead of {before[name] or 'none'}"
         for name, now in _news(run_dir, facts).items()
         if name in before
     ]

@@ -1,6 +1,7 @@
 """The first state of a training that starts from a policy: `train --start-from`."""
 
 import functools
+import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -46,7 +47,7 @@ def from_policy(
             changed := changes(policy.robot or {}, fingerprint(config.physics.robot))
         ):
             warnings.warn(f"{path} was trained with another robot: {changed}", stacklevel=2)
-        if policy.config.control_dt != config.control_dt:
+        if not math.isclose(policy.config.control_dt, config.control_dt):
             steps = f"{policy.config.control_dt:g} s, this training one of {config.control_dt:g} s"
             warnings.warn(f"{path} was trained with a control step of {steps}", stacklevel=2)
         try:

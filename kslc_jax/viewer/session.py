@@ -48,12 +48,12 @@ def steady(
       dead_zone: of the training's commands [m/s].
 
     Returns:
-      (command [3], (True if the robot walks, True if the yaw rate alone makes it move)).
+      (command [3], (True if the robot walks, True if the yaw rate counts as turning)).
     """
     speed, rate = float(np.hypot(*velocity[:2])), abs(float(velocity[2]))
     faster, walks = _held(speed, before[0], dead_zone)
     quicker, turns = _held(rate, before[1], TURNING)
-    return velocity * np.array([faster, faster, quicker]), (walks, turns)
+    return velocity * np.array([faster, faster, 1.0 if walks else quicker]), (walks, turns)
 
 
 def _held(size: float, on: bool, edge: float) -> tuple[float, bool]:
