@@ -29,7 +29,7 @@ import jax
 import tyro
 
 from benchmarks import gpu_all, throughput, timing
-from kslc_jax import runtime
+from kslc_jax import processors, runtime
 from kslc_jax.config import Config, ConfigError, preset
 
 Run = Callable[[], Any]
@@ -74,7 +74,7 @@ def first_calls(makes: Mapping[str, Callable[[], Run]]) -> dict[str, Run]:
         print(f"{name}: compiled after {time.monotonic() - start:.0f} s", flush=True)
         return run
 
-    with ThreadPoolExecutor(runtime.usable_cpus()) as pool:
+    with ThreadPoolExecutor(processors.usable()) as pool:
         runs = dict(zip(makes, pool.map(one, makes), strict=True))
     return {name: run for name, run in runs.items() if run is not None}
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from kslc_jax import runtime
+from kslc_jax import processors
 from kslc_jax.config import Config
 
 Seconds = dict[str, list[float]]
@@ -79,7 +79,7 @@ def machine() -> dict[str, Any]:
     import mujoco
 
     return {
-        "cpu": runtime.cpu_model(),
+        "cpu": processors.model(),
         "cores": os.cpu_count(),
         "memory_gib": round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30),
         "device": jax.devices()[0].device_kind,

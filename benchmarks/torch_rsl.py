@@ -19,7 +19,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from benchmarks.gym_env import XBot
-from kslc_jax import observations, physics, runtime
+from kslc_jax import observations, physics, processors
 from kslc_jax.config import Config
 
 
@@ -85,7 +85,7 @@ class Workers(VecEnv):
         raw = context.RawArray("f", self.num_envs * sum(_widths(config).values()))
         self._columns = {n: torch.from_numpy(x) for n, x in _columns(config, raw).items()}
         self._pipes = []
-        for part in np.array_split(np.arange(self.num_envs), processes or runtime.usable_cpus()):
+        for part in np.array_split(np.arange(self.num_envs), processes or processors.usable()):
             ours, theirs = context.Pipe()
             rows = range(part[0], part[-1] + 1)
             context.Process(target=_work, args=(config, raw, rows, theirs), daemon=True).start()

@@ -26,7 +26,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from kslc_jax import cli, files, runtime
+from kslc_jax import cli, files, processors, runtime
 from kslc_jax.config import ConfigError
 
 PYTHONS = ((3, 11), (3, 13))
@@ -148,10 +148,10 @@ def check_cache() -> str:
 
 def check_cores() -> str:
     """Cores that this process may use, of all that the machine has, and what limits them."""
-    usable, there = runtime.usable_cpus(), os.cpu_count() or 1
+    usable, there = processors.usable(), os.cpu_count() or 1
     if usable >= there:
         return f"{usable} of {there}"
-    return f"{usable} of {there} ({'quota' if usable < runtime.affine_cpus() else 'affinity'})"
+    return f"{usable} of {there} ({'quota' if usable < processors.affine() else 'affinity'})"
 
 
 CHECKS: tuple[tuple[str, Callable[[], str], str], ...] = (

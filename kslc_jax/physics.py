@@ -28,8 +28,8 @@ with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a notice about an 
     from mujoco import mjx
 
 from kslc_jax import ground as ground_lib
+from kslc_jax import processors
 from kslc_jax import robot as robot_lib
-from kslc_jax import runtime
 from kslc_jax.config import PhysicsConfig
 from kslc_jax.ground import Ground
 from kslc_jax.motors import SERVO_DAMPING, drive
@@ -243,7 +243,7 @@ def _batch(robot: Robot, size: int, threads: int, written: frozenset[str]) -> mu
     """
     key = (robot, size, threads, written)
     if key not in _batches:
-        count = threads or runtime.usable_cpus()
+        count = threads or processors.usable()
         _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=count)
     return _batches[key]
 

@@ -8,9 +8,7 @@ import ctypes.util
 import faulthandler
 import inspect
 import logging
-import math
 import os
-import platform
 import statistics
 import sys
 import time
@@ -21,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from kslc_jax import processors
 from kslc_jax.errors import UserError
 
 BAD_JAX = ("0.10.", "0.11.0")
@@ -101,8 +100,8 @@ def prepare(gl: bool = True) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if folder := cache_dir():
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(folder))
-    if usable_cpus() < affine_cpus():
-        os.environ.setdefault(XLA_THREADS, str(usable_cpus()))
+    if processors.usable() < processors.affine():
+        os.environ.setdefault(XLA_THREADS, str(processors.usable()))
     if others := fix_numerics():
         print(
             f"warning: {', '.join(others)} ignored: numbers would change, or errors come",
@@ -168,68 +167,6 @@ def _read_as(text: str, like: Value) -> Value:
         with contextlib.suppress(ValueError):
             return type(like)(text)
     return like if text == str(like) else text
-
-
-def affine_cpus() -> int:
-    """Number of CPUs that the affinity of the process allows."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def cpu_quota(root: Path = Path("/")) -> float:
-    """Number of CPUs that the process's control groups and their parents allow.
-
-    It may be a fraction. Infinity means no limit. It reads Linux's cgroups of version 2 (`cpu.max`)
-    and 1. `root` is the root of the file system.
-    """
-    quota = math.inf
-    for line in _read(root / "proc/self/cgroup").splitlines():
-        _, controllers, path = line.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
-            continue
-        top = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
-        parts = [part for part in path.split("/") if part]
-        # In a container the path may be that of the host. The container's own group is then `top`.
-        groups = [top.joinpath(*parts[:depth]) for depth in range(len(parts) + 1)]
-        quota = min([quota, *map(_group_quota, groups)])
-    return quota
-
-
-def _group_quota(group: Path) -> float:
-    """Number of CPUs that one control group allows."""
-    v1 = _read(group / "cpu.cfs_quota_us"), _read(group / "cpu.cfs_period_us")
-    words = _read(group / "cpu.max").split() or [word.strip() for word in v1]
-    try:
-        quota, period = map(float, words)
-    except ValueError:  # the quota is "max", or the files do not exist
-        return math.inf
-    return quota / period if quota > 0 and period > 0 else math.inf
-
-
-def _read(path: Path) -> str:
-    """Text of a file; empty if it cannot be read."""
-    try:
-        return path.read_text()
-    except OSError:
-        return ""
-
-
-def usable_cpus() -> int:
-    """Number of threads that this process can run at the same time, by affinity and quota."""
-    return max(1, math.ceil(min(affine_cpus(), cpu_quota())))
-
-
-VECTORS = ("avx512f", "avx2", "avx")
-"""Flags in /proc/cpuinfo of vector instructions, the widest first. XLA chooses its code by them."""
-
-
-def cpu_model(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
-    """Name of the processor, and its widest vector instructions on Linux."""
-    facts = dict(line.split("\t", 1) for line in _read(cpuinfo).splitlines() if "\t" in line)
-    name, flags = (facts.get(key, "").strip("\t: ") for key in ("model name", "flags"))
-    widest = next((flag for flag in VECTORS if flag in flags.split()), "")
-    return ", ".join(filter(None, (name or platform.processor(), widest)))
 
 
 def choose_gl() -> None:

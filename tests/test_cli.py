@@ -27,6 +27,7 @@ from kslc_jax import (
     physics,
     play,
     plots,
+    processors,
     reproduce,
     robot,
     runtime,
@@ -383,18 +384,18 @@ def cgroup(root, groups: str, **files: str) -> None:
 )
 def test_the_quota_of_cpus(tmp_path, groups, files, quota):
     cgroup(tmp_path, groups, **files)
-    assert runtime.cpu_quota(tmp_path) == quota
+    assert processors.quota(tmp_path) == quota
 
 
 def test_the_processor_and_its_vector_instructions(tmp_path):
     path = tmp_path / "cpuinfo"
     path.write_text("processor\t: 0\nmodel name\t: A CPU\nflags\t\t: fpu avx avx2 sse\n\nother\n")
-    assert runtime.cpu_model(path) == "A CPU, avx2"
-    assert "," not in runtime.cpu_model(tmp_path / "none")
+    assert processors.model(path) == "A CPU, avx2"
+    assert "," not in processors.model(tmp_path / "none")
 
 
 def test_a_machine_without_control_groups(tmp_path):
-    assert runtime.cpu_quota(tmp_path) == math.inf
+    assert processors.quota(tmp_path) == math.inf
 
 
 def test_threads_are_as_many_as_affinity_and_quota_allow(monkeypatch):
@@ -407,9 +408,9 @@ def test_threads_are_as_many_as_affinity_and_quota_allow(monkeypatch):
         (4, 16.0, 4, "4 of 64 (affinity)"),
         (64, math.inf, 64, "64 of 64"),
     ):
-        monkeypatch.setattr(runtime, "affine_cpus", lambda affine=affine: affine)
-        monkeypatch.setattr(runtime, "cpu_quota", lambda quota=quota: quota)
-        assert (runtime.usable_cpus(), doctor.check_cores()) == (usable, said)
+        monkeypatch.setattr(processors, "affine", lambda affine=affine: affine)
+        monkeypatch.setattr(processors, "quota", lambda quota=quota: quota)
+        assert (processors.usable(), doctor.check_cores()) == (usable, said)
         os.environ.pop(runtime.XLA_THREADS, None)
         runtime.prepare(gl=False)
         assert os.environ.pop(runtime.XLA_THREADS, None) == (
@@ -423,7 +424,7 @@ def test_the_engine_takes_as_many_threads_as_are_allowed(monkeypatch):
         physics.mujoco.batch, "Batch", lambda model, size, nthread: asked.append(nthread)
     )
     monkeypatch.setattr(physics, "_batches", {})
-    monkeypatch.setattr(runtime, "usable_cpus", lambda: 3)
+    monkeypatch.setattr(processors, "usable", lambda: 3)
     physics._batch(robot.load(), 7, 0, frozenset())
     physics._batch(robot.load(), 7, 5, frozenset())
     assert asked == [3, 5]

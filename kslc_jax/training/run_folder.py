@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from kslc_jax import __version__, files, physics, runtime
+from kslc_jax import __version__, files, physics, processors
 from kslc_jax import config as config_lib
 from kslc_jax.checkpoint_format import (
     has_checkpoints,
@@ -43,7 +43,7 @@ def versions() -> dict[str, str | int]:
     return {
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "cpu": runtime.cpu_model(),
+        "cpu": processors.model(),
         "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
         "device": str(jax.devices()[0].device_kind),
         "kslc_jax": __version__,
