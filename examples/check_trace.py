@@ -4,10 +4,12 @@ python examples/check_trace.py policy.onnx
 python examples/check_trace.py policy.onnx --program my_controller.py
 
 `export` has written policy.npz and policy.json beside policy.onnx. The program is a Python file
-with a class `Controller(path, vx, vy, heading)`. It has `phase`, that of the gait clock, and
-`targets(quat, angvel, joint_pos, joint_vel)`, which returns the joint targets [n, rad] of one
-control step. The default is the runner beside this file. The exit code is 0 if all targets agree,
-else 1.
+with a class `Controller(path, vx, vy, heading)`. It has `phase`, that of the gait clock, `action`,
+the last action [n], and `targets(quat, angvel, joint_pos, joint_vel)`, which returns the joint
+targets [n, rad] of one control step. The checker sets `action` to the recorded one after each
+step: else the rounding of one step would grow over the next ones.
+
+The default program is the runner beside this file. The exit code is 0 if all targets agree, else 1.
 """
 
 import argparse
@@ -51,6 +53,7 @@ def first_difference(controller_class, policy, tolerance):
                     f"({step * data['control_dt']:.2f} s): {data['joint_names'][worst]} should go "
                     f"to {wanted[worst]:.4f} rad, not to {found[worst]:.4f}"
                 )
+            controller.action = trace["action"][trial, step].astype(float)
     return None
 
 

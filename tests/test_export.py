@@ -402,6 +402,18 @@ def test_the_data_name_the_robot_and_the_other_files(acting, checker, contracted
         changed.write_bytes(before)
 
 
+def test_the_checker_gives_the_recorded_actions(runner, checker, contracted):
+    """So an error of one step does not reach the next one, in which it would grow."""
+
+    class Forgetful(runner.Controller):
+        def targets(self, *measured):
+            target = super().targets(*measured)
+            self.action = self.action + 0.1
+            return target
+
+    assert checker.first_difference(Forgetful, contracted, 1e-4) is None
+
+
 def test_the_checker_names_the_first_wrong_target(runner, checker, contracted):
     """A program that mixes up two joints, and one that forgets to advance its clock."""
 
