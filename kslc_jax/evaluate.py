@@ -25,7 +25,7 @@ from kslc_jax.evaluation.tables import console, table
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
-SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0)
+SPEEDS = (0.0, *options.SPEEDS)
 """Commanded speeds [m/s] of XBot-L, if none are given."""
 
 CONDITIONS = ("fidelity", "ground", "seeds", "seconds", "noise", "seed")

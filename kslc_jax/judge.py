@@ -5,9 +5,9 @@ A bar is a requirement on a metric. The policy runs in full C MuJoCo at high fid
 commanded speed, under random changes of the command from four starting headings (16 robots whose
 masses, motors and friction differ), and with each perturbation of sim2sim. A robot of another size
 than XBot-L gets other speeds and perturbations, by dynamic similarity. --harsh adds punches (forces
-of 0.08 s), arms that follow random targets, and uneven ground. Prints one table: each bar,
-its required value, the worst measured value, and the condition of that value. The exit code is 0
-even if the policy misses a bar. docs/sim2sim.md describes the measurements.
+of 0.08 s), arms that follow random targets, and uneven ground. Prints one table: each bar, its
+required value, the worst measured value, and the condition of that value. The exit code is 0 even
+if the policy misses a bar. docs/sim2sim.md describes the measurements.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy. Files that --json has
 written are read instead: a table shows them side by side, and names the median. One run decides
@@ -120,7 +120,7 @@ class Args:
     seconds: float | None = None
     """Length of the trials at constant speeds [s]; None: 60, with --quick 15."""
     harsh: bool = False
-    """Also try the policy under punches of 300 N and of 500 N (only told, no bar), with arms that
+    """Also try the policy under punches of 300 N and of 500 N (reported, no bar), with arms that
     follow random targets, and on uneven ground: 18 times 32 trials of 30 s."""
     drake: bool = False
     """Also try the policy in Drake. This is slow, and needs the package drake."""

@@ -103,10 +103,8 @@ def prepare(gl: bool = True) -> None:
     if processors.usable() < processors.affine():
         os.environ.setdefault(XLA_THREADS, str(processors.usable()))
     if others := fix_numerics():
-        print(
-            f"warning: {', '.join(others)} ignored: numbers would change, or errors come",
-            file=sys.stderr,
-        )
+        why = "would change numbers or raise errors"
+        print(f"warning: {', '.join(others)} ignored: {why}", file=sys.stderr)
     if gl:
         choose_gl()
 

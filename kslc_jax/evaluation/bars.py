@@ -24,7 +24,7 @@ SLOWEST = 0.5
 
 HARSH: dict[str, tuple[float, tuple[float, ...]]] = {
     "punch=300": (0.95, (0.0, 1.0, 2.0, 3.0)),
-    "punch=500": (0.0, (0.0, 1.0, 2.0, 3.0)),  # only told
+    "punch=500": (0.0, (0.0, 1.0, 2.0, 3.0)),  # reported, no bar
     "arms=1": (1.0, (0.0, 1.0, 2.0)),
     "rough:0.05": (1.0, (0.0, 1.0, 2.0)),
     "rough:0.03": (1.0, (3.0,)),

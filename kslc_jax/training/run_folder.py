@@ -33,7 +33,7 @@ class RunError(UserError, RuntimeError):
     """A run folder cannot be used. The message gives the reason and a way out."""
 
 
-def versions() -> dict[str, str | int]:
+def versions() -> dict[str, str]:
     """Versions of software and hardware that the bits of a result depend on.
 
     `git` is the commit of this package's own checkout, or "unknown" if it runs from none.
