@@ -111,7 +111,7 @@ def test_harsh_conditions_are_tried_as_named(monkeypatch):
     assert [name for name in found] == list(HARSH) and found["punch=300"]["wanted"] == 0.95
     punched, harder, held, rough, waves, slope = (setting for setting, _, _ in seen)
     assert punched.randomize.punch == (300, 300) and punched.seconds == 30
-    assert harder.randomize.punch == (500, 500) and found["punch=500"]["wanted"] == 0.0  # reported, no bar
+    assert harder.randomize.punch == (500, 500) and found["punch=500"]["wanted"] == 0.0
     assert held.randomize.held_arms == 1 and not held.physics.terrain.kinds
     assert rough.physics.terrain.rough == 0.05 and slope.physics.terrain.slope == 10
     assert seen[4][1:] == ((3.0,), 32) and waves.physics.terrain.rough == 0.03

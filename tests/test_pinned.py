@@ -12,7 +12,6 @@ import hashlib
 import importlib.metadata
 import json
 import os
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ import numpy as np
 import pytest
 
 from kslc_jax import config as config_lib
-from kslc_jax import export, load_policy, physics, train_step
+from kslc_jax import export, load_policy, physics, processors, train_step
 from kslc_jax.evaluation import trials
 
 FILE = Path(__file__).parent / "data" / "pinned_metrics.json"
@@ -42,13 +41,8 @@ PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
 
 def machine() -> dict[str, str]:
     """All that decides the last bit of a number: hardware, compiler flags and package versions."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
-    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
-    flags = [line.split(":")[1].strip() for line in lines if line.startswith("flags")]
     return {
-        "cpu": names[0] if names else platform.processor(),
-        "avx512": str("avx512f" in flags[0].split() if flags else "unknown"),
+        "cpu": processors.model(),
         "flags": os.environ["XLA_FLAGS"],
         **{name: importlib.metadata.version(name) for name in PACKAGES},
     }
