@@ -22,11 +22,13 @@ class Command:
     heading: jax.Array  # [] rad, world
     moving: jax.Array  # [] bool, False: stand still (clock off, both feet down)
     wanted: jax.Array  # [2] m/s, vx, vy that the velocity approaches, see with_velocity
+    turns: jax.Array  # [] bool, True: it turns on the spot while it asks for no velocity, see steer
 
 
 def standing(heading: jax.Array) -> Command:
     """The command of a robot that stands, with the heading [rad]."""
-    return Command(jnp.zeros(3), heading, jnp.zeros((), bool), jnp.zeros(2))
+    never = jnp.zeros((), bool)
+    return Command(jnp.zeros(3), heading, moving=never, wanted=jnp.zeros(2), turns=never)
 
 
 def sample(
@@ -90,27 +92,32 @@ def steer(config: CommandConfig, command: Command, yaw: jax.Array, dt: float) ->
     """The command `dt` seconds later; called at every step.
 
     vx and vy approach the wanted ones. The yaw rate follows from the heading error (HG).
+
+    A turn on the spot ends where the yaw rate falls to `TURNING`, and does not begin again. Else a
+    robot that is to stand could turn away on purpose, to be rewarded for steps instead.
     """
     error = maths.wrap_angle(command.heading - yaw)
     rate = jnp.clip(config.heading_gain * error, -config.max_yaw_rate, config.max_yaw_rate)
-    return _approach(config, command, rate, dt)
+    turns = command.turns & (jnp.abs(rate) > TURNING)
+    return _approach(config, command.replace(turns=turns), rate, dt)
 
 
 def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) -> Command:
     """The command with the velocity [3] in place of its own; in the dead zone, vx and vy are zero.
 
     With `config.acceleration` only the yaw rate changes at once. vx and vy are then the wanted
-    ones, and `steer` approaches them.
+    ones, and `steer` approaches them. A standing robot may turn again.
     """
     walks = maths.norm(velocity[:2]) > config.dead_zone
-    return _approach(config, command.replace(wanted=velocity[:2] * walks), velocity[2], 0.0)
+    fresh = command.replace(wanted=velocity[:2] * walks, turns=jnp.ones((), bool))
+    return _approach(config, fresh, velocity[2], 0.0)
 
 
 def _approach(config: CommandConfig, command: Command, rate: jax.Array, dt: float) -> Command:
     """Moves vx and vy towards the wanted ones for `dt` seconds, and sets the yaw rate [rad/s].
 
-    With `config.stand_still`, a command of zero means "stand" (`moving` is False) unless it turns
-    faster than `TURNING`.
+    With `config.stand_still`, a command of zero means "stand" (`moving` is False), unless it
+    `turns` faster than `TURNING`.
     """
     wanted = planar = command.wanted
     if config.acceleration > 0:
@@ -120,7 +127,8 @@ def _approach(config: CommandConfig, command: Command, rate: jax.Array, dt: floa
     velocity = jnp.append(planar, rate)
     if not config.stand_still:
         return command.replace(velocity=velocity, moving=jnp.ones((), bool))
-    moving = jnp.any(wanted != 0.0) | jnp.any(planar != 0.0) | (jnp.abs(rate) > TURNING)
+    turning = command.turns & (jnp.abs(rate) > TURNING)
+    moving = jnp.any(wanted != 0.0) | jnp.any(planar != 0.0) | turning
     return command.replace(velocity=jnp.where(moving, velocity, 0.0), moving=moving)
 
 

@@ -7,6 +7,7 @@ finds the first difference.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -153,8 +154,10 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     second = np.arange(len(SHARES)) == 1
     commands = np.stack([speeds, SIDEWAYS * second, HEADING * second], axis=1).astype(np.float32)
 
-    def one(carry: tuple[env.EnvState, jax.Array], _: None):
+    def one(command: jax.Array, carry: tuple[env.EnvState, jax.Array], _: None):
         state, alive = carry
+        velocity = command.at[2].set(0.0)  # the heading alone decides the turn
+        state = trials.with_command(config, state, velocity, command[2])
         before = state.physics
         key = jax.random.key(0)  # nothing is random
         new, out = env.step(config, state, policy.act_on(state.history), key, policy.curriculum)
@@ -174,7 +177,8 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
         state = env.reset(config, key, policy.curriculum)
         state = trials.facing_command(config, state, command)
         steps = round(seconds / config.control_dt)
-        (_, _), rows = jax.lax.scan(one, (state, jnp.ones((), bool)), None, steps)
+        begin = state, jnp.ones((), bool)
+        _, rows = jax.lax.scan(functools.partial(one, command), begin, None, steps)
         return state.gait.phase, rows
 
     keys = jax.random.split(jax.random.key(0), len(SHARES))

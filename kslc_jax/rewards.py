@@ -258,7 +258,7 @@ def collision(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Arra
 
 
 def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """|q| + 0.1 |dq| + e (restless |da|^2 + shuffle (1 - exp(-|v|^2 / shuffle_speed^2))) (ours).
+    """|q| + 0.1 |dq| + e (restless |da|^2 + shuffle (1 - exp(-|v| / shuffle_speed))) (ours).
 
     q [rad] are the joint angles, dq [rad/s] their speeds, da the change of the action, v [m/s] the
     velocities of both feet, and e is `_exactness`. The term is 0 while the command is to move.
@@ -270,11 +270,13 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
     The cost of the feet has a bound. Without one, the total of a robot that steps is below zero.
     With `only_positive` it is then 0 whatever the robot does, so the robot cannot learn to stand.
+    With |v|^2 in place of |v|, a robot that trembles has the whole cost already, and the last few
+    cm/s cost nothing.
     """
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
     unquiet = cfg.restless * _action_change(x)
-    squared = jnp.sum(jnp.square(x.signals.foot_vel)) / cfg.shuffle_speed**2
-    unquiet += cfg.shuffle * (1.0 - jnp.exp(-squared))
+    feet = norm(x.signals.foot_vel.reshape(-1))
+    unquiet += cfg.shuffle * (1.0 - jnp.exp(-feet / cfg.shuffle_speed))
     return jnp.where(x.command.moving, 0.0, moved + unquiet * _exactness(cfg, x))
 
 

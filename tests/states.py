@@ -76,7 +76,7 @@ def make_gait(**changes: Any) -> GaitState:
 
 def make_command(**changes: Any) -> Command:
     """Zero velocity; the clock runs."""
-    start = dict(velocity=np.zeros(3), heading=0.0, moving=True, wanted=np.zeros(2))
+    start = dict(velocity=np.zeros(3), heading=0.0, moving=True, wanted=np.zeros(2), turns=True)
     if "velocity" in changes:  # the wanted one, unless the test names another
         start["wanted"] = np.asarray(changes["velocity"])[:2]
     return _fill(Command, start, changes)

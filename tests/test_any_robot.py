@@ -145,7 +145,8 @@ def test_too_little_of_the_trunk_is_an_error(biped):
 
 def command(vx: float) -> Command:
     velocity = jnp.array([vx, 0.0, 0.0])
-    return Command(velocity, jnp.zeros(()), jnp.ones((), bool), velocity[:2])
+    yes = jnp.ones((), bool)
+    return Command(velocity, jnp.zeros(()), moving=yes, wanted=velocity[:2], turns=yes)
 
 
 def test_widths_follow_from_the_number_of_joints(biped, setup):

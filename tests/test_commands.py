@@ -215,15 +215,39 @@ def test_when_a_command_means_standing_still(velocity, moving, left, jit):
     np.testing.assert_allclose(always.velocity, [*left[:2], velocity[2]])
 
 
-def test_a_standing_robot_that_drifts_turns_back():
+def test_a_turn_on_the_spot_ends_and_does_not_begin_again():
     """A heading error of 0.3 rad commands 0.5 * 0.3 rad/s, which is more than 0.1 rad/s."""
     config = dataclasses.replace(PAPER, stand_still=True)
-    command = make_command(heading=0.0, moving=False)
-    assert not bool(commands.steer(config, command, jnp.asarray(0.19), DT).moving)
-    drifted = commands.steer(config, command, jnp.asarray(0.3), DT)
-    assert bool(drifted.moving)
-    np.testing.assert_allclose(drifted.velocity, [0.0, 0.0, -0.15], atol=1e-6)
-    assert not bool(commands.steer(config, drifted, jnp.asarray(0.1), DT).moving)
+    turning = commands.steer(config, make_command(heading=0.0), jnp.asarray(0.3), DT)
+    assert bool(turning.moving)
+    np.testing.assert_allclose(turning.velocity, [0.0, 0.0, -0.15], atol=1e-6)
+    there = commands.steer(config, turning, jnp.asarray(0.19), DT)
+    assert not bool(there.moving) and not there.velocity.any()
+    away = commands.steer(config, there, jnp.asarray(0.3), DT)
+    assert not bool(away.moving) and not away.velocity.any()
+    again = commands.with_velocity(config, away, jnp.zeros(3))  # as a user's command, or a trial's
+    assert bool(commands.steer(config, again, jnp.asarray(0.3), DT).moving)
+
+
+def test_no_robot_can_choose_whether_its_command_is_to_stand():
+    """4000 drawn commands of the recipe, the same for robots that turn wildly and for robots that
+    go straight: who is to step, and when, is the same. Only turns on the spot end with the turn.
+    """
+    config, steps = preset("laptop").command, 150
+    assert steps * DT * config.acceleration > 3.5  # enough for a stop from the running speed
+    at = jax.jit(jax.vmap(lambda c, yaw: commands.steer(config, c, yaw, DT), (0, None)))
+    running = make_command(velocity=[3.5, 0.0, 0.0])
+    for before in (commands.standing(jnp.zeros(())), running):
+        straight = wild = drawn = draw_many(config, before=before)
+        walks = jnp.any(drawn.wanted != 0.0, axis=1)
+        stands = ~walks & ~drawn.turns
+        assert float(stands.mean()) > 0.1 and float(jnp.mean(~walks & ~stands)) > 0.01
+        for yaw in 0.04 * np.arange(1, steps + 1):
+            straight, wild = at(straight, jnp.zeros(())), at(wild, jnp.asarray(yaw))
+            decided = walks | stands
+            np.testing.assert_array_equal(straight.moving[decided], wild.moving[decided])
+            assert bool(straight.moving[walks].all())
+        assert not bool(wild.moving[stands].any())
 
 
 def test_fractions_and_ranges():

@@ -101,7 +101,7 @@ class RewardConfig:
     """Weight of squared action changes within the term `stand_still`, at full size."""
     shuffle: float = 0.0
     """Weight of moving feet within `stand_still`, at full size."""
-    shuffle_speed: float = 0.2
+    shuffle_speed: float = 0.3
     """Root of the summed squared speeds of both feet [m/s] at which the cost of moving feet is
     0.63 of `shuffle`. Faster feet cost more, up to `shuffle`."""
     speed_limit_margin: float = 0.9
