@@ -29,16 +29,16 @@ from kslc_jax.errors import UserError
 from kslc_jax.fingerprint import Fingerprint, changes, fingerprint
 from kslc_jax.robots import copying
 
-SCHEMA_VERSION = 7
+SCHEMA_VERSION = 8
 """Version of a checkpoint's items. Raise it when you change the tree of `TrainState`, and note
 below the parts that the older schemas lack."""
 
-OLDER_POLICIES = (1, 2, 3, 4, 5, 6)
+OLDER_POLICIES = (1, 2, 3, 4, 5, 6, 7)
 """Older schemas: only their policy can still be read. 1 lacks the ceiling of the learning rate. 2
 lacks the average of the actor, the time of the next command, and the curriculum's sums of commands
 at the top. 3 lacks the shifts of the soles, the uneven ground and the disturbances. 4 lacks the
 time of the last command at the top. 5 lacks the wanted command, and calls the air time of a landed
-foot `landing`. 6 has the mean velocity in place of its error."""
+foot `landing`. 6 has the mean velocity in place of its error. 7 lacks `turns` of the command."""
 
 COMMITTED = "Checkpoint commit was successful\n"
 """Content of the files `commit_success.txt`."""
