@@ -30,7 +30,7 @@ class Curriculum:
     top_deviation: jax.Array  # [] m/s, of vx minus commanded vx
     top_scale: jax.Array  # [] m/s, of max(commanded vx, `top_error_floor`)
     top_falls: jax.Array  # [] fading sum of falls under and soon after commands at the top
-    top_minutes: jax.Array  # [] fading sum of minutes under commands at the top
+    top_minutes: jax.Array  # [] fading sum of minutes under and soon after them
     updates: jax.Array  # [] int, updates since the last change
 
 
@@ -49,7 +49,7 @@ class Progress:
     top_deviation: jax.Array  # [] m/s, of vx minus commanded vx
     top_scale: jax.Array  # [] m/s, of max(commanded vx, `top_error_floor`)
     top_falls: jax.Array  # [] falls under commands at the top, and up to `falls_after` later
-    top_minutes: jax.Array  # [] minutes under commands at the top, sum over the robots
+    top_minutes: jax.Array  # [] minutes of the same time, sum over the robots
 
 
 def init(config: Config) -> Curriculum:
@@ -98,7 +98,7 @@ def top_error(state: Curriculum) -> jax.Array:
 
 
 def top_falls(state: Curriculum) -> jax.Array:
-    """Falls per minute [] of commands at the top, see `CurriculumConfig.falls_after`."""
+    """Falls per minute [] under and soon after commands at the top, see `falls_after`."""
     return state.top_falls / jnp.maximum(state.top_minutes, 1e-6)
 
 

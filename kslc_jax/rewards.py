@@ -222,13 +222,13 @@ def knee_distance(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.
 
 
 def default_joint_pos(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
-    """exp(-100 (x - 0.1)), at most 1, minus 0.01 |joint angles|.
+    """exp(-100 (x - default_pose_margin)), at most 1, minus 0.01 |joint angles|.
 
     x [rad] is the size of (roll, yaw) of the left leg plus that of the right leg.
     """
     q = x.signals.joint_pos
     legs = sum(norm(q[np.array(robot.roll_and_yaw(side), int)]) for side in ("left", "right"))
-    return jnp.exp(-100.0 * jnp.clip(legs - 0.1, 0.0, 50.0)) - 0.01 * norm(q)
+    return jnp.exp(-100.0 * jnp.clip(legs - cfg.default_pose_margin, 0.0, 50.0)) - 0.01 * norm(q)
 
 
 def orientation(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Array:
@@ -353,8 +353,10 @@ def evaluate(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """(reward [], unweighted value of every term).
 
-    The reward is the weighted sum times `dt`. With `only_positive` it is at least 0 (HG).
+    The reward is the weighted sum times `dt`. With `only_positive` it is at least 0 (HG). A fall
+    then costs `fall` (ours): a robot that brakes earns little, so it has little else to lose.
     """
     raw = {name: term(cfg, robot, dt, x) for name, term in TERMS.items()}
     total = dt * sum(getattr(cfg.weights, name) * value for name, value in raw.items())
-    return jnp.maximum(total, 0.0) if cfg.only_positive else total, raw
+    total = jnp.maximum(total, 0.0) if cfg.only_positive else total
+    return total - cfg.fall * x.signals.torso_contact, raw

@@ -216,8 +216,9 @@ def progress_of(config: Config, out: Outcome) -> Progress:
     fast_tracking, fast_count = mean_over(reached, out.fast)
     episode_steps, episode_count = mean_over(out.episode_steps, done)
     gait, _ = mean_over(out.terms["feet_contact_number"], out.fast)
-    top = out.top & ~out.broken
-    settled_top, floor = top & out.settled, config.curriculum.top_error_floor
+    settled_top = out.top & out.settled & ~out.broken
+    exposed = (out.top | out.braking) & ~out.broken
+    floor = config.curriculum.top_error_floor
     return Progress(
         tracking=tracking,
         tracking_count=tracking_count,
@@ -228,8 +229,8 @@ def progress_of(config: Config, out: Outcome) -> Progress:
         gait=gait,
         top_deviation=jnp.sum((out.speed - out.commanded) * settled_top),
         top_scale=jnp.sum(jnp.maximum(out.commanded, floor) * settled_top),
-        top_falls=jnp.sum(out.terminated & (out.top | out.braking) & ~out.broken),
-        top_minutes=jnp.sum(top) * (config.control_dt / 60.0),
+        top_falls=jnp.sum(out.terminated & exposed),
+        top_minutes=jnp.sum(exposed) * (config.control_dt / 60.0),
     )
 
 

@@ -351,6 +351,12 @@ CASES: list[tuple[str, RewardConfig, dict[str, Any], float]] = [
         {"joint_pos": joints(left_leg_roll=0.06, right_leg_yaw=0.05)},
         0.36709842,
     ),
+    (
+        "default_joint_pos",
+        dataclasses.replace(KSLC, default_pose_margin=0.11),
+        {"joint_pos": joints(left_leg_roll=0.06, right_leg_yaw=0.05)},
+        0.99921898,
+    ),
     ("default_joint_pos", KSLC, {"joint_pos": joints(left_knee=0.3, left_elbow_pitch=0.4)}, 0.995),
     # (e^(-10 * 0.1) + e^(-20 * 0.05)) / 2.
     (
@@ -517,6 +523,17 @@ def test_reward_is_never_negative_unless_asked():
     assert float(rewards.evaluate(cfg, robot.load(), DT, x)[0]) == 0.0
     free = dataclasses.replace(cfg, only_positive=False)
     assert float(rewards.evaluate(free, robot.load(), DT, x)[0]) == pytest.approx(-0.004, rel=1e-4)
+
+
+def test_a_fall_costs_once_and_beside_the_clip():
+    """0.01 * 1.2 for perfect tracking, less 5 in the step of the fall."""
+    cfg = dataclasses.replace(only(tracking_lin_vel=1.2), fall=5.0)
+    for dt in (0.01, 0.005):
+        upright, fallen = (
+            float(rewards.evaluate(cfg, robot.load(), dt, make_inputs(torso_contact=down))[0])
+            for down in (False, True)
+        )
+        assert upright == pytest.approx(1.2 * dt) and fallen == pytest.approx(1.2 * dt - 5.0)
 
 
 def test_marching_at_command_0_still_earns_something():

@@ -284,4 +284,4 @@ def test_slow_commands_at_the_top_count_as_if_they_were_faster():
     assert float(progress.top_deviation) == pytest.approx(0.2)
     assert float(progress.top_scale) == pytest.approx(7.0)
     assert float(progress.top_falls) == 3.0
-    assert float(progress.top_minutes) == pytest.approx(3 * 0.01 / 60)
+    assert float(progress.top_minutes) == pytest.approx(4 * 0.01 / 60)

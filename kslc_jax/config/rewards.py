@@ -91,6 +91,9 @@ class RewardConfig:
     """Allowed distance of the feet [m] (HG)."""
     knee_distance: Range = (0.2, 0.25)
     """Allowed distance of the knees [m] (HG)."""
+    default_pose_margin: float = 0.1
+    """Sum over the legs of the sizes of (roll, yaw) [rad] that costs nothing in `default_joint_pos`
+    (HG)."""
     lean_per_speed: float = 0.0
     """Forward lean per commanded speed [rad per m/s] at which `orientation` is best."""
     exact_from: float = 0.5
@@ -106,6 +109,8 @@ class RewardConfig:
     0.63 of `shuffle`. Faster feet cost more, up to `shuffle`."""
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which `dof_vel_limits` counts."""
+    fall: float = 0.0
+    """Cost of a fall: once, not per second, and also with `only_positive`."""
 
     def __post_init__(self):
         require(self.momentum_scale > 0, "rewards.momentum_scale must be positive")
@@ -113,6 +118,7 @@ class RewardConfig:
         require(self.clearance_width > 0, "rewards.clearance_width must be positive")
         require(self.max_contact_force >= 0, "rewards.max_contact_force must not be negative")
         require(self.shuffle_speed > 0, "rewards.shuffle_speed must be positive")
+        require(self.fall >= 0, "rewards.fall must not be negative")
         require(self.exact_from < self.exact_full, "rewards.exact_from must lie below exact_full")
         check_range("rewards.feet_distance", self.feet_distance)
         check_range("rewards.knee_distance", self.knee_distance)
