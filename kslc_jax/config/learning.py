@@ -50,7 +50,7 @@ class CurriculumConfig:
     """For `top_error`, the error is divided by this speed [m/s] if the command is slower. Slow
     walking then needs less relative accuracy."""
     top_falls: float = 1e9
-    """Most falls per minute under commands in the top `v_step` and soon after. 1e9: no condition."""
+    """Most falls per minute under commands in the top `v_step`, and soon after. 1e9: any number."""
     falls_after: float = 0.0
     """Falls and time count for `top_falls` also within this time [s] after a command at the top has
     ended: many robots fall when they brake."""
