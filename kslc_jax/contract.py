@@ -128,6 +128,12 @@ def mjcf(policy: Policy) -> str:
     return spec.to_xml()
 
 
+def _golden_commands(v_max: float) -> np.ndarray:
+    """[R, 3] vx, vy [m/s], heading [rad]."""
+    speeds, second = np.asarray(SHARES) * v_max, np.arange(len(SHARES)) == 1
+    return np.stack([speeds, SIDEWAYS * second, HEADING * second], axis=1).astype(np.float32)
+
+
 def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarray]:
     """Records R golden trials in the training's engine, each under one constant command.
 
@@ -150,9 +156,7 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     config = trials.without_joint_noise(config)
     robot = physics.robot_for(config.physics)
     home = jnp.asarray(robot.default_qpos[7:], jnp.float32)
-    speeds = np.asarray(SHARES) * float(policy.curriculum.v_max)
-    second = np.arange(len(SHARES)) == 1
-    commands = np.stack([speeds, SIDEWAYS * second, HEADING * second], axis=1).astype(np.float32)
+    commands = _golden_commands(float(policy.curriculum.v_max))
 
     def one(command: jax.Array, carry: tuple[env.EnvState, jax.Array], _: None):
         state, alive = carry

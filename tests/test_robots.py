@@ -290,13 +290,15 @@ def test_capsules_fit():
 def test_hips_count_unless_they_are_wide():
     rng = np.random.default_rng(0)
     thigh = rng.uniform([-0.04, 0.06, -0.4], [0.04, 0.14, 0.0], (4000, 3))
-    clouds = {"left_thigh": thigh, "right_thigh": thigh * [1, -1, 1]}
-    plain = capsules.fit_all(clouds)
-    for half_width, counts in ((0.05, True), (0.2, False)):
+    plain = capsules.fit_all({"left_thigh": thigh, "right_thigh": thigh * [1, -1, 1]})
+    for half_width, own in ((0.05, False), (0.2, True)):
         size = np.array([half_width, half_width, 0.05])
-        wider = np.concatenate([thigh, rng.uniform(-size, size, (4000, 3)) + np.array([0, 0.1, 0])])
-        fitted = capsules.fit_all(clouds, {"left_thigh": wider, "right_thigh": wider * [1, -1, 1]})
-        assert (fitted["left_thigh"].radius != plain["left_thigh"].radius) is counts
+        hip = rng.uniform(-size, size, (4000, 3)) + np.array([0, 0.1, 0])
+        clouds = {"left_hip": hip, "left_thigh": thigh}
+        clouds |= {"right_hip": hip * [1, -1, 1], "right_thigh": thigh * [1, -1, 1]}
+        fitted = capsules.fit_all(clouds)
+        assert (set(fitted) == set(clouds)) is own
+        assert (fitted["left_thigh"].radius == plain["left_thigh"].radius) is own
         np.testing.assert_array_equal(
             fitted["right_thigh"].start, fitted["left_thigh"].start * [1, -1, 1]
         )

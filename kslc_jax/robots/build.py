@@ -52,8 +52,14 @@ class Rig:
 
     def points(self, bodies: list[int]) -> np.ndarray:
         """[k, 3] points on the shapes of bodies of `bare`, world at home [m]."""
-        own = [self.bodies[body - 1] for body in bodies]
-        return shapes.surface(self.source, shapes.of_bodies(self.source, own))
+        return shapes.surface(self.source, self._shapes(bodies))
+
+    def collides(self, bodies: list[int]) -> bool:
+        """True if a shape of these bodies of `bare` collides in the MJCF."""
+        return bool(shapes.collides(self.source.model)[self._shapes(bodies)].any())
+
+    def _shapes(self, bodies: list[int]) -> list[int]:
+        return shapes.of_bodies(self.source, [self.bodies[body - 1] for body in bodies])
 
 
 def spec(about: Description, fidelity: Literal["train", "high"]) -> mujoco.MjSpec:
@@ -184,9 +190,10 @@ def _add_capsules(rig: Rig) -> None:
     """Adds one capsule per part, and the contact pairs of training."""
     members = capsules.parts(rig.bare, rig.anatomy)
     clouds = {name: rig.points(bodies) for name, bodies in members.items()}
-    wider = capsules.with_hips(rig.bare, rig.anatomy)
-    hips = {name: rig.points(bodies) for name, bodies in wider.items()}
-    fitted = capsules.slim(capsules.fit_all(clouds, hips))
+    for side in SIDES:  # at high fidelity only those shapes collide that collide in the MJCF
+        if rig.collides(members[f"{side}_thigh"]) and not rig.collides(members[f"{side}_hip"]):
+            del clouds[f"{side}_hip"]
+    fitted = capsules.slim(capsules.fit_all(clouds))
     style = rig.spec.find_default("bumper")
     for name, capsule in fitted.items():
         body = members[name][0]

@@ -20,9 +20,9 @@ THINNEST = 0.3
 
 
 THICKER = 1.5
-"""A thigh's capsule covers the hip's shapes, too, if that makes it thicker by at most this factor.
+"""A thigh's capsule stands for the hip, too, if that makes it thicker by less than this factor.
 
-A thicker one would keep the legs apart where only the hips are wide."""
+A thicker one would keep the legs apart where only the hips are wide. Such hips have their own."""
 
 _MIRROR = np.array([1.0, -1.0, 1.0])
 
@@ -37,31 +37,25 @@ class Capsule:
 
 
 def parts(model: mujoco.MjModel, anatomy: Anatomy) -> dict[str, list[int]]:
-    """Bodies of each part: "trunk", "left_thigh", "left_shank", "left_foot", "left_forearm", ...
+    """Bodies of each part: "trunk", "left_hip", "left_thigh", "left_shank", "left_forearm", ...
 
-    The forearm has all bodies from the elbow on. An arm without elbow is one part, the forearm.
+    The capsule of a part moves with its first body. The hip has all bodies of the leg above the
+    thigh, the lowest one first. The forearm has all bodies from the elbow on. An arm without elbow
+    is one part, the forearm.
     """
     bodies, parent = model.jnt_bodyid[1:], model.body_parentid
     found = {"trunk": [anatomy.trunk]}
     for side, foot in zip(("left", "right"), anatomy.feet, strict=True):
         knee = int(bodies[anatomy.roles[f"{side}_knee"]])
-        found |= {f"{side}_thigh": [int(parent[knee])], f"{side}_shank": [knee]}
-        found[f"{side}_foot"] = [foot]
+        thigh = int(parent[knee])
+        leg = bodies[list(anatomy.limbs[f"{side}_leg"])].tolist()
+        found[f"{side}_hip"] = [body for body in reversed(leg) if body < thigh]
+        found |= {f"{side}_thigh": [thigh], f"{side}_shank": [knee], f"{side}_foot": [foot]}
         if arm := anatomy.limbs.get(f"{side}_arm"):
             elbow = int(bodies[anatomy.roles.get(f"{side}_elbow", arm[0])])
             if elbow != bodies[arm[0]]:
                 found[f"{side}_upper_arm"] = [int(parent[elbow])]
             found[f"{side}_forearm"] = [int(b) for b in bodies[list(arm)] if b >= elbow]
-    return found
-
-
-def with_hips(model: mujoco.MjModel, anatomy: Anatomy) -> dict[str, list[int]]:
-    """Bodies of "left_thigh" and "right_thigh" and of the hips above them."""
-    found = {}
-    for side in ("left", "right"):
-        bodies = model.jnt_bodyid[1:][list(anatomy.limbs[f"{side}_leg"])].tolist()
-        knee = model.jnt_bodyid[1 + anatomy.roles[f"{side}_knee"]]
-        found[f"{side}_thigh"] = [body for body in bodies if body < knee]
     return found
 
 
@@ -77,29 +71,35 @@ def geom_name(name: str) -> str:
     return f"{name}_bumper"
 
 
-def fit_all(
-    clouds: dict[str, np.ndarray], wider: dict[str, np.ndarray] | None = None
-) -> dict[str, Capsule]:
+def fit_all(clouds: dict[str, np.ndarray]) -> dict[str, Capsule]:
     """A capsule per part, left and right ones mirror images of each other.
+
+    Where `THICKER` allows it, the thighs' capsules stand for the hips, which get none.
 
     Args:
       clouds: points [k, 3] on the surface of each part, world at home [m]. Parts without a point
         get no capsule.
-      wider: clouds that replace some of these, unless the capsule gets much thicker.
     """
-    fitted: dict[str, Capsule] = {}
-    for name in clouds:
-        twin = _twin(name)
-        if twin in fitted:
-            left = fitted[twin]
-            fitted[name] = replace(left, start=left.start * _MIRROR, end=left.end * _MIRROR)
-        elif len(both := _with_twin(clouds, name)):
-            fitted[name] = fit(both)
-            if wider and name in wider:
-                wide = fit(_with_twin(wider, name))
-                if wide.radius < THICKER * fitted[name].radius:
-                    fitted[name] = wide
-    return fitted
+    both = {name: _with_twin(clouds, name) for name in clouds if not name.startswith("right")}
+    fitted = {name: fit(points) for name, points in both.items() if len(points)}
+    if {"left_hip", "left_thigh"} <= set(fitted):
+        legs = {
+            f"{side}_leg": np.concatenate([clouds[f"{side}_hip"], clouds[f"{side}_thigh"]])
+            for side in ("left", "right")
+        }
+        wide = fit(_with_twin(legs, "left_leg"))
+        if wide.radius < THICKER * fitted["left_thigh"].radius:
+            fitted["left_thigh"] = wide
+            del fitted["left_hip"]
+    return {
+        name: fitted[name] if name in fitted else _mirrored(fitted[_twin(name)])
+        for name in clouds
+        if name in fitted or _twin(name) in fitted
+    }
+
+
+def _mirrored(capsule: Capsule) -> Capsule:
+    return replace(capsule, start=capsule.start * _MIRROR, end=capsule.end * _MIRROR)
 
 
 def _twin(name: str) -> str:
@@ -158,7 +158,7 @@ def strangers(names: list[str]) -> list[tuple[str, str]]:
 
 def joined(a: str, b: str) -> bool:
     """True for the trunk and a part that starts at it."""
-    first = ("thigh", "upper_arm")
+    first = ("hip", "thigh", "upper_arm")
     return "trunk" in (a, b) and any(name.endswith(first) for name in (a, b))
 
 
