@@ -156,7 +156,7 @@ def tracking_mean_vel(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> 
 def _exactness(cfg: RewardConfig, x: Inputs) -> jax.Array:
     """Factor [] that grows from 0 to 1 while v_max grows from `exact_from` to `exact_full`.
 
-    Terms that demand exactness would hinder a policy that cannot walk yet.
+    Terms that demand exactness or caution would hinder a policy that cannot walk yet.
     """
     grown = (x.v_max - cfg.exact_from) / (cfg.exact_full - cfg.exact_from)
     return jnp.clip(grown, 0.0, 1.0)
@@ -354,9 +354,10 @@ def evaluate(
     """(reward [], unweighted value of every term).
 
     The reward is the weighted sum times `dt`. With `only_positive` it is at least 0 (HG). A fall
-    then costs `fall` (ours): a robot that brakes earns little, so it has little else to lose.
+    then costs `fall` times `_exactness` (ours): a robot that brakes earns little, so it has little
+    else to lose. From the start, this cost would teach the robot to shuffle.
     """
     raw = {name: term(cfg, robot, dt, x) for name, term in TERMS.items()}
     total = dt * sum(getattr(cfg.weights, name) * value for name, value in raw.items())
     total = jnp.maximum(total, 0.0) if cfg.only_positive else total
-    return total - cfg.fall * x.signals.torso_contact, raw
+    return total - cfg.fall * _exactness(cfg, x) * x.signals.torso_contact, raw

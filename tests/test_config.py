@@ -253,7 +253,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.feet_distance": (0.17, 0.5),
         "rewards.knee_distance": (0.17, 0.25),
         "rewards.lean_per_speed": 0.03,
-        "rewards.default_pose_margin": 0.2,
+        "rewards.default_pose_margin": 0.15,
         "rewards.fall": 5.0,
         "rewards.weights.feet_contact_number": 2.0,
         "rewards.weights.feet_clearance": 0.7,

@@ -525,15 +525,16 @@ def test_reward_is_never_negative_unless_asked():
     assert float(rewards.evaluate(free, robot.load(), DT, x)[0]) == pytest.approx(-0.004, rel=1e-4)
 
 
-def test_a_fall_costs_once_and_beside_the_clip():
-    """0.01 * 1.2 for perfect tracking, less 5 in the step of the fall."""
+@pytest.mark.parametrize(("v_max", "cost"), [(0.5, 0.0), (1.5, 2.5), (2.5, 5.0)])
+def test_a_fall_costs_once_and_beside_the_clip(v_max, cost):
+    """0.01 * 1.2 for perfect tracking, less 5 in the step of the fall, once the range has grown."""
     cfg = dataclasses.replace(only(tracking_lin_vel=1.2), fall=5.0)
     for dt in (0.01, 0.005):
         upright, fallen = (
-            float(rewards.evaluate(cfg, robot.load(), dt, make_inputs(torso_contact=down))[0])
-            for down in (False, True)
+            float(rewards.evaluate(cfg, robot.load(), dt, x)[0])
+            for x in (make_inputs(torso_contact=down, v_max=v_max) for down in (False, True))
         )
-        assert upright == pytest.approx(1.2 * dt) and fallen == pytest.approx(1.2 * dt - 5.0)
+        assert upright == pytest.approx(1.2 * dt) and fallen == pytest.approx(1.2 * dt - cost)
 
 
 def test_marching_at_command_0_still_earns_something():

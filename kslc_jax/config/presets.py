@@ -113,7 +113,7 @@ _LAPTOP = _override(
         "feet_distance": (0.17, 0.5),
         "knee_distance": (0.17, 0.25),
         "lean_per_speed": 0.03,
-        "default_pose_margin": 0.2,
+        "default_pose_margin": 0.15,
         "fall": 5.0,
         "exact_full": 2.0,
         "restless": 0.3,

@@ -97,7 +97,7 @@ class RewardConfig:
     lean_per_speed: float = 0.0
     """Forward lean per commanded speed [rad per m/s] at which `orientation` is best."""
     exact_from: float = 0.5
-    """`tracking_mean_vel`, `restless` and `shuffle` are 0 while v_max [m/s] <= exact_from."""
+    """`tracking_mean_vel`, `restless`, `shuffle`, `fall` are 0 while v_max [m/s] <= exact_from."""
     exact_full: float = 2.5
     """They have full size while v_max [m/s] >= exact_full."""
     restless: float = 0.0
@@ -110,7 +110,7 @@ class RewardConfig:
     speed_limit_margin: float = 0.9
     """Share of the joint speed limit above which `dof_vel_limits` counts."""
     fall: float = 0.0
-    """Cost of a fall: once, not per second, and also with `only_positive`."""
+    """Cost of a fall, at full size: once, not per second, and also with `only_positive`."""
 
     def __post_init__(self):
         require(self.momentum_scale > 0, "rewards.momentum_scale must be positive")
