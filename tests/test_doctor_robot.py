@@ -18,6 +18,16 @@ DATA = Path(__file__).parent / "data"
 BIPED = str(DATA / "biped.toml")
 
 
+def require(name: str) -> None:
+    """Skips the test if the package with the robot's MJCF is missing."""
+    try:
+        description.read(name)
+    except description.RobotError as error:
+        if "pip install" not in str(error):
+            raise
+        pytest.skip(str(error))
+
+
 def patient(name: str) -> Patient:
     return Patient(
         robot.load(name=name), robot.load("high", name=name), similar.preset("laptop", name)
@@ -103,6 +113,13 @@ def test_contacts_in_random_poses(biped, monkeypatch):
     deaf = robot.load(name=BIPED, iterations=7)  # another model than the fixture's
     deaf.mj_model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     assert statics.unfelt(deaf, biped.high) == (there, there)
+
+
+@pytest.mark.parametrize("name", description.known())
+def test_training_feels_the_contacts_of_every_shipped_robot(name):
+    require(name)
+    missed, there = statics.unfelt(robot.load(name=name), robot.load("high", name=name))
+    assert there > 20 and missed <= 0.02 * there
 
 
 # -------------------------------------------------------------------------------------- warnings
@@ -313,10 +330,7 @@ def test_a_home_outside_the_range_is_refused(tmp_path, capsys):
 
 @pytest.mark.slow(reason="half a minute: reads meshes and compiles MJX")
 def test_the_g1(capsys):
-    try:
-        description.read("unitree_g1")
-    except description.RobotError as error:
-        pytest.skip(str(error))
+    require("unitree_g1")
     assert doctor.main(["robot", "unitree_g1"]) == 0
     said = capsys.readouterr().out
     assert "actor 74, critic 109" in said and "nothing looks wrong" in said
