@@ -22,7 +22,7 @@ class Command:
     heading: jax.Array  # [] rad, world
     moving: jax.Array  # [] bool, False: stand still (clock off, both feet down)
     wanted: jax.Array  # [2] m/s, vx, vy that the velocity approaches, see with_velocity
-    turns: jax.Array  # [] bool, True: it turns on the spot while it asks for no velocity, see steer
+    turns: jax.Array  # [] bool, True: it may turn on the spot, see steer
 
 
 def standing(heading: jax.Array) -> Command:
@@ -93,8 +93,8 @@ def steer(config: CommandConfig, command: Command, yaw: jax.Array, dt: float) ->
 
     vx and vy approach the wanted ones. The yaw rate follows from the heading error (HG).
 
-    A turn on the spot ends where the yaw rate falls to `TURNING`, and does not begin again. Else a
-    robot that is to stand could turn away on purpose, to be rewarded for steps instead.
+    A turn on the spot ends when the yaw rate falls to `TURNING`. It does not begin again. Otherwise
+    a robot that should stand could turn away on purpose, to be rewarded for steps instead.
     """
     error = maths.wrap_angle(command.heading - yaw)
     rate = jnp.clip(config.heading_gain * error, -config.max_yaw_rate, config.max_yaw_rate)
@@ -106,7 +106,7 @@ def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) 
     """The command with the velocity [3] in place of its own; in the dead zone, vx and vy are zero.
 
     With `config.acceleration` only the yaw rate changes at once. vx and vy are then the wanted
-    ones, and `steer` approaches them. A standing robot may turn again.
+    ones, and `steer` approaches them. The new command may turn on the spot.
     """
     walks = maths.norm(velocity[:2]) > config.dead_zone
     fresh = command.replace(wanted=velocity[:2] * walks, turns=jnp.ones((), bool))

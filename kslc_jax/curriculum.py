@@ -30,7 +30,7 @@ class Curriculum:
     top_deviation: jax.Array  # [] m/s, of vx minus commanded vx
     top_scale: jax.Array  # [] m/s, of max(commanded vx, `top_error_floor`)
     top_falls: jax.Array  # [] fading sum of falls under and soon after commands at the top
-    top_minutes: jax.Array  # [] fading sum of minutes under and soon after them
+    top_minutes: jax.Array  # [] fading sum of the minutes in which such falls count
     updates: jax.Array  # [] int, updates since the last change
 
 
@@ -49,7 +49,7 @@ class Progress:
     top_deviation: jax.Array  # [] m/s, of vx minus commanded vx
     top_scale: jax.Array  # [] m/s, of max(commanded vx, `top_error_floor`)
     top_falls: jax.Array  # [] falls under commands at the top, and up to `falls_after` later
-    top_minutes: jax.Array  # [] minutes of the same time, sum over the robots
+    top_minutes: jax.Array  # [] minutes in which such falls count, sum over the robots
 
 
 def init(config: Config) -> Curriculum:

@@ -270,8 +270,8 @@ def stand_still(cfg: RewardConfig, robot: Robot, dt: float, x: Inputs) -> jax.Ar
 
     The cost of the feet has a bound. Without one, the total of a robot that steps is below zero.
     With `only_positive` it is then 0 whatever the robot does, so the robot cannot learn to stand.
-    With |v|^2 in place of |v|, a robot that trembles has the whole cost already, and the last few
-    cm/s cost nothing.
+    With |v|^2 in place of |v|, a robot that trembles would pay nearly the whole cost. It would save
+    little by calmer feet, and the last few cm/s would cost nothing.
     """
     moved = norm(x.signals.joint_pos) + 0.1 * norm(x.signals.joint_vel)
     unquiet = cfg.restless * _action_change(x)
@@ -354,8 +354,8 @@ def evaluate(
     """(reward [], unweighted value of every term).
 
     The reward is the weighted sum times `dt`. With `only_positive` it is at least 0 (HG). A fall
-    then costs `fall` times `_exactness` (ours): a robot that brakes earns little, so it has little
-    else to lose. From the start, this cost would teach the robot to shuffle.
+    then costs `fall` times `_exactness` (ours). A robot that brakes earns little, so without this
+    cost it loses little by a fall. In early training the cost would teach the robot to shuffle.
     """
     raw = {name: term(cfg, robot, dt, x) for name, term in TERMS.items()}
     total = dt * sum(getattr(cfg.weights, name) * value for name, value in raw.items())

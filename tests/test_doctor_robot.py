@@ -7,6 +7,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from packages import described
 
 from kslc_jax import doctor, robot, similar
 from kslc_jax.checkup import findings, picture, report, statics, trials
@@ -16,16 +17,6 @@ from kslc_jax.robots import description
 
 DATA = Path(__file__).parent / "data"
 BIPED = str(DATA / "biped.toml")
-
-
-def require(name: str) -> None:
-    """Skips the test if the package with the robot's MJCF is missing."""
-    try:
-        description.read(name)
-    except description.RobotError as error:
-        if "pip install" not in str(error):
-            raise
-        pytest.skip(str(error))
 
 
 def patient(name: str) -> Patient:
@@ -117,7 +108,7 @@ def test_contacts_in_random_poses(biped, monkeypatch):
 
 @pytest.mark.parametrize("name", description.known())
 def test_training_feels_the_contacts_of_every_shipped_robot(name):
-    require(name)
+    described(name)
     missed, there = statics.unfelt(robot.load(name=name), robot.load("high", name=name))
     assert there > 20 and missed <= 0.02 * there
 
@@ -330,7 +321,7 @@ def test_a_home_outside_the_range_is_refused(tmp_path, capsys):
 
 @pytest.mark.slow(reason="half a minute: reads meshes and compiles MJX")
 def test_the_g1(capsys):
-    require("unitree_g1")
+    described("unitree_g1")
     assert doctor.main(["robot", "unitree_g1"]) == 0
     said = capsys.readouterr().out
     assert "actor 74, critic 109" in said and "nothing looks wrong" in said

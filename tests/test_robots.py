@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import mujoco
 import numpy as np
 import pytest
+from packages import described
 
 from kslc_jax import fingerprint
 from kslc_jax.robots import anatomy, build, capsules, contacts, description, shapes
@@ -91,12 +92,7 @@ OPTIONS = ("timestep", "iterations", "ls_iterations")
 
 
 def model(name: str, fidelity: str = "train") -> mujoco.MjModel:
-    try:
-        return build.spec(description.read(name), fidelity).compile()
-    except RobotError as error:
-        if "pip install" not in str(error):
-            raise
-        pytest.skip(str(error))
+    return build.spec(described(name), fidelity).compile()
 
 
 def home(m: mujoco.MjModel) -> np.ndarray:

@@ -52,8 +52,8 @@ class CurriculumConfig:
     top_falls: float = 1e9
     """Most falls per minute under commands in the top `v_step`, and soon after. 1e9: any number."""
     falls_after: float = 0.0
-    """Falls and time count for `top_falls` also within this time [s] after a command at the top has
-    ended: many robots fall when they brake."""
+    """`top_falls` also counts falls and minutes up to this time [s] after a command at the top:
+    many robots fall when they brake."""
     settle_seconds: float = 0.0
     """A command is "settled" from this time [s] after its change on. Only settled commands count
     for tracking. A robot needs time to reach a new speed, and more in a wider range."""

@@ -22,7 +22,8 @@ THINNEST = 0.3
 THICKER = 1.5
 """A thigh's capsule stands for the hip, too, if that makes it thicker by less than this factor.
 
-A thicker one would keep the legs apart where only the hips are wide. Such hips have their own."""
+A thicker one would keep the legs apart where only the hips are wide. Such hips have a capsule of
+their own."""
 
 _MIRROR = np.array([1.0, -1.0, 1.0])
 
