@@ -91,7 +91,8 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
         action *= 1.0 + config.env.action_noise * self.rng.standard_normal(self.robot.count)
         self.last_action, self.action = self.action, action
         joint_vel = self.data.qvel[6:].copy()
-        self.simulate(self.robot.default_qpos[7:] + config.env.action_scale * action)
+        scale = motors.action_scale(config.env, self.robot)
+        self.simulate(self.robot.default_qpos[7:] + scale * action)
         self.time += 1
         self._read()
         terminated = self._torso_height() < 0.0

@@ -38,7 +38,7 @@ def rollout(engine: Engine, threads: int) -> None:
     import jax
     import jax.numpy as jnp
 
-    from kslc_jax import config, curriculum, env, networks, physics
+    from kslc_jax import config, curriculum, env, motors, networks, physics
 
     cfg = config.preset("debug")
     simulator = config.PhysicsConfig(engine=engine, threads=threads)
@@ -48,7 +48,8 @@ def rollout(engine: Engine, threads: int) -> None:
         params = networks.init(cfg, key)
         keys = jax.random.split(key, ROBOTS)
         robots = jax.vmap(env.reset, (None, 0, None))(cfg, keys, curriculum.init(cfg))
-        target = cfg.env.action_scale * networks.policy(cfg, params, robots.history).mean
+        scale = motors.action_scale(cfg.env, physics.robot_for(simulator))
+        target = networks.policy(cfg, params, robots.history).mean * scale
         step = jax.vmap(physics.step, (None, 0, 0, 0, None))
 
         def one(state: physics.PhysicsState, _: None) -> tuple[physics.PhysicsState, None]:

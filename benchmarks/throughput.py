@@ -14,7 +14,7 @@ import jax
 import tyro
 
 from benchmarks import timing
-from kslc_jax import physics, train_step
+from kslc_jax import motors, physics, train_step
 from kslc_jax import rollout as rollout_lib
 from kslc_jax.config import Config, preset
 
@@ -22,10 +22,10 @@ from kslc_jax.config import Config, preset
 def physics_only(config: Config) -> Callable[[], Any]:
     """A function that runs only the physics of one rollout, with random joint targets."""
     state = train_step.make(config)[0]()
-    joints = physics.robot_for(config.physics).count
+    scale = motors.action_scale(config.env, physics.robot_for(config.physics))
 
     def one(envs, key):
-        target = config.env.action_scale * jax.random.normal(key, (config.env.num_envs, joints))
+        target = scale * jax.random.normal(key, (config.env.num_envs, len(scale)))
         friction = config.randomize.ground_friction
         new = jax.vmap(lambda s, t, d: physics.step(config.physics, s, t, d, friction))(
             envs.physics, target, envs.dynamics

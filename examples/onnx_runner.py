@@ -28,8 +28,8 @@ class Controller:
         one.intra_op_num_threads = 1  # the network is small; more threads only wait
         self.network = onnxruntime.InferenceSession(path, one, providers=["CPUExecutionProvider"])
         text = self.network.get_modelmeta().custom_metadata_map
-        if text.get("metadata_version") != "4":
-            raise SystemExit(f"error: {path} has no metadata of version 4, see docs/export.md")
+        if text.get("metadata_version") != "5":
+            raise SystemExit(f"error: {path} has no metadata of version 5, see docs/export.md")
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
         self.wanted = self.velocity = np.zeros(2)
@@ -102,7 +102,7 @@ class Controller:
         dt = dt or m.control_dt
         self.approach(dt)
         self.phase = (self.phase + dt / self.cycle(gait, abs(self.velocity[0]))) % 1
-        return m.default_joint_pos + m.action_scale * self.action
+        return m.default_joint_pos + np.array(m.action_scale) * self.action
 
 
 def motor_torque(m, target, q, dq):

@@ -19,7 +19,7 @@ from kslc_jax import __version__, files
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
-METADATA_VERSION = 4
+METADATA_VERSION = 5
 """Version of `metadata`; it grows when a name or its meaning changes."""
 
 TRACE_SECONDS = 10.0
@@ -93,7 +93,7 @@ def metadata(policy: Policy) -> dict[str, Any]:
         "effort_limit": robot.effort_limit.tolist(),
         "speed_limit": robot.speed_limit.tolist(),
         "corner_speed": motors.CORNER_SPEED,
-        "action_scale": config.env.action_scale,
+        "action_scale": motors.action_scale(config.env, robot).tolist(),
         "action_clip": config.env.action_clip,
         "held_joints": [name for name, h in zip(robot.joint_names, held, strict=True) if h],
         "history_length": config.env.frames,
@@ -148,7 +148,7 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     import jax
     import jax.numpy as jnp
 
-    from kslc_jax import env, physics
+    from kslc_jax import env, motors, physics
     from kslc_jax.evaluation import trials
 
     setting = trials.Setting(trials.engine(policy, "train"))  # on the flat floor
@@ -173,7 +173,7 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
             "joint_vel": before.qvel[6:],
             "frame": state.history[-1],
             "action": new.last_action,
-            "target": home + config.env.action_scale * new.last_action,
+            "target": home + motors.action_scale(config.env, robot) * new.last_action,
         }
         return (new, alive), jax.tree.map(lambda x: jnp.where(alive, x, jnp.nan), row)
 

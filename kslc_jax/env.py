@@ -16,6 +16,7 @@ from kslc_jax import (
     gait,
     ground,
     maths,
+    motors,
     observations,
     physics,
     randomize,
@@ -151,7 +152,8 @@ def step(
 
     noise = state.dynamics.noise
     action = _applied_action(config, action, state.last_action, noise, keys[0])
-    target = jnp.asarray(robot.default_qpos[7:], jnp.float32) + config.env.action_scale * action
+    home = jnp.asarray(robot.default_qpos[7:], jnp.float32)
+    target = home + motors.action_scale(config.env, robot) * action
     disturbed, target, force = disturbances.apply(
         config.randomize, robot, state.disturbances, state.time, target, config.control_dt
     )

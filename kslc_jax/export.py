@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 Format = Literal["onnx", "stablehlo", "orbax"]
 Network = Callable[[np.ndarray], np.ndarray]
 """Histories [B, K, W] -> actions [B, n]."""
+Layers = list[tuple[np.ndarray, np.ndarray]]
+"""Kernels [in, out] and biases [out]."""
 
 INSTALL = "pip install 'kslc_jax[export]'"
 TOLERANCE = 1e-5
@@ -78,9 +80,7 @@ class Args:
 # ------------------------------------------------------------------------------------------- onnx
 
 
-def dense_layers(
-    config: Config, params: Params, network: Literal["actor", "estimator"]
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def dense_layers(config: Config, params: Params, network: Literal["actor", "estimator"]) -> Layers:
     """Kernels [in, out] and biases [out] of a network as a plain MLP.
 
     Its input is the flat history. If there is an estimator, the estimated velocity follows as
@@ -94,26 +94,38 @@ def dense_layers(
 
     weights = jax.tree.map(lambda x: np.asarray(x, np.float64), params[network])
     layers = [weights[f"Dense_{i}"] for i in range(len(weights))]
+    robot = physics.robot_for(config.physics)
+    table = observations.actor_table(robot)
+    gain = np.tile(networks.input_gain(config, table), config.env.frames)
+    if network == "actor" and config.network.estimator:
+        gain = np.append(gain, np.ones(networks.ESTIMATED))
     if not config.network.symmetric:
-        return [(layer["kernel"], layer["bias"]) for layer in layers]
+        plain = [(layer["kernel"], layer["bias"]) for layer in layers]
+        return _with_gain(gain, plain)
 
     def pairs(size: int) -> Parity:
         return networks.parity(np.roll(np.arange(size), size // 2), np.ones(size))
 
-    robot = physics.robot_for(config.physics)
-    frame = networks.mirrored_frame(observations.actor_table(robot), robot)
+    frame = networks.mirrored_frame(table, robot)
     inputs, outputs = [frame] * config.env.frames, networks.mirrored_velocity()
     if network == "actor":
         inputs += [outputs] if config.network.estimator else []
         outputs = networks.mirrored_joints(robot)
     bases = [_stacked(inputs), *map(pairs, getattr(config.network, network)), outputs]
-    return [
+    symmetric = [
         (
             a.even @ even["kernel"] @ b.even.T + a.odd @ odd["kernel"] @ b.odd.T,
             even["bias"] @ b.even.T,
         )
         for even, odd, a, b in zip(layers[::2], layers[1::2], bases[:-1], bases[1:], strict=True)
     ]
+    return _with_gain(gain, symmetric)
+
+
+def _with_gain(gain: np.ndarray, layers: Layers) -> Layers:
+    """The layers with `gain` [in] on the inputs of the first one."""
+    (kernel, bias), *others = layers
+    return [(gain[:, None] * kernel, bias), *others]
 
 
 def _stacked(parts: list[Parity]) -> Parity:

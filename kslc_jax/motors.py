@@ -6,7 +6,9 @@ Both engines share these functions: `xp` is numpy or jax.numpy.
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
+from kslc_jax.config import EnvConfig
 from kslc_jax.robot import Robot
 
 CORNER_SPEED = 0.75
@@ -29,6 +31,12 @@ LEAST_CHANGE = 0.01
 
 FRICTION_SPEED = 0.2
 """Joint speed [rad/s] at which Coulomb friction has 76 % of its full size (smoothed by tanh)."""
+
+
+def action_scale(config: EnvConfig, robot: Robot) -> np.ndarray:
+    """Change of each joint's target per unit of action [n, rad], see `EnvConfig.least_torque`."""
+    least = config.least_torque * robot.effort_limit / robot.kp
+    return np.maximum(config.action_scale, least).astype(np.float32)
 
 
 def motor_torque(robot: Robot, dynamics: Any, q, dq, target, xp: Any = jnp):

@@ -89,7 +89,7 @@ def test_a_quarter_of_the_height_and_an_eighth_of_the_mass():
     small = dataclasses.replace(XBOT, length_ratio=0.25, mass_ratio=0.125)
     laptop = config.preset("laptop")
     c = similar.scaled(laptop, small)
-    assert (c.curriculum.v_limit, c.gait.cycle_time, c.curriculum.cycle_min) == (2.25, 0.32, 0.19)
+    assert (c.curriculum.v_limit, c.gait.cycle_time, c.curriculum.cycle_min) == (2.0, 0.32, 0.19)
     assert c.command.vy == (-0.15, 0.15) and c.randomize.base_mass == (-0.625, 0.625)
     assert c.rewards.momentum_scale == pytest.approx(3.0 / 64, rel=1e-2)  # three digits
     assert c.rewards.base_height_target == pytest.approx(0.2225, rel=1e-2)

@@ -146,7 +146,7 @@ CASES = {
         "port_cant, star_cant: an action of 1 takes 2 of the largest",
     ),
     "actions too weak": (
-        '"mast" = { kp = 5 }\n',
+        '"mast" = { kp = 5 }\n[config]\n"env.least_torque" = 0.0\n',
         (),
         "motors: kp, effort",
         "mast: an action of 1 takes 0.021",

@@ -37,6 +37,8 @@ from kslc_jax.config import XBOT_L, ConfigError, PhysicsConfig, preset
 from kslc_jax.evaluation import trials
 from kslc_jax.robots import description
 
+SCALE = np.array(([0.25] * 4 + [0.85] * 2) * 2 + [0.25] * 4)
+"""rad per unit of action. The ankles: 0.15 x 85 N m / (15 N m/rad)."""
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
 ROBOTS = 8
@@ -149,13 +151,13 @@ def test_the_graph_estimates_the_velocity_and_then_acts(policy, onnx_file):
 def test_metadata(symmetric, xbot):
     """The numbers are typed by hand where the paper or Humanoid-Gym gives them."""
     data = contract.metadata(symmetric)
-    assert data["metadata_version"] == 4 and data["train_step"] == 7
+    assert data["metadata_version"] == 5 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
     assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
     assert data["effort_limit"][3] == 212.5
     assert data["speed_limit"] == [12] * 12 + [7] * 4
     assert data["default_joint_pos"] == [0] * 16 and data["control_dt"] == 0.01
-    assert data["action_scale"] == 0.25 and data["action_clip"] == 18
+    assert data["action_scale"] == pytest.approx(SCALE) and data["action_clip"] == 18
     assert data["history_length"] == 3 and data["observation_clip"] == 18
     assert sum(c["width"] for c in data["frame"]) == observations.actor_width(XBOT)
     assert data["frame"][1] == {"name": "command", "width": 3, "scale": (2, 2, 1)}
@@ -377,7 +379,7 @@ def test_a_golden_trace_is_what_its_policy_does(acting, contracted):
         held = policy.config.env.arms == "held"
         action[:, XBOT.is_arm] *= not held
         np.testing.assert_allclose(trace["action"][:, step], action, atol=1e-5)
-    np.testing.assert_allclose(trace["target"], 0.25 * trace["action"], atol=1e-6)
+    np.testing.assert_allclose(trace["target"], SCALE * trace["action"], atol=1e-6)
 
 
 def test_the_runner_follows_the_golden_trace(runner, checker, contracted):

@@ -14,7 +14,7 @@ import slow
 from states import XBOT
 
 from kslc_jax import maths, motors, physics, randomize, robot
-from kslc_jax.config import XBOT_L, HighFidelity, PhysicsConfig, RandomizeConfig
+from kslc_jax.config import XBOT_L, EnvConfig, HighFidelity, PhysicsConfig, RandomizeConfig
 from kslc_jax.robots import description
 
 ENGINES = ("mjx", "mujoco")
@@ -32,6 +32,14 @@ def standing(config: PhysicsConfig) -> physics.PhysicsState:
     """State of a robot at rest with its feet on the floor."""
     qpos = jnp.asarray(physics.robot_for(config).default_qpos, jnp.float32).at[2].set(0.885)
     return physics.initial_state(config, qpos, jnp.zeros(22))
+
+
+@pytest.mark.parametrize(("least", "ankle"), [(0.0, 0.25), (0.04, 0.25), (0.15, 0.85)])
+def test_soft_servos_have_larger_actions(least, ankle):
+    """By hand: 0.15 x 85 N m / (15 N m/rad) = 0.85 rad. All other servos are stiff enough."""
+    scale = motors.action_scale(EnvConfig(least_torque=least), XBOT)
+    expected = ([0.25] * 4 + [ankle] * 2) * 2 + [0.25] * 4
+    np.testing.assert_allclose(scale, expected, rtol=1e-6)
 
 
 class TestMotorTorque:

@@ -508,7 +508,7 @@ def test_progress_fits_into_80_columns():
         "ETA",
         "1/2400",
         "feet_contact_number",
-        "+1.8462",
+        "+2.7693",
         "4.812e+05",
     ):
         assert word in out

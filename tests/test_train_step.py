@@ -54,9 +54,9 @@ def test_state_is_donated(made):
     assert leaf.is_deleted()
 
 
-@pytest.mark.parametrize(("fades", "v_max", "coef"), [(True, 3.5, 0.00075), (False, 3.5, 0.003)])
+@pytest.mark.parametrize(("fades", "v_max", "coef"), [(True, 3.5, 0.003 / 7), (False, 3.5, 0.003)])
 def test_entropy_bonus_fades_with_the_way_that_is_left(made, fades, v_max, coef):
-    """0.003 at v_max 0.5 m/s and 0 at 4.5 m/s: a quarter of it at 3.5 m/s."""
+    """0.003 at v_max 0.5 m/s and 0 at 4.0 m/s: a seventh of it at 3.5 m/s."""
     config, init, _ = made
     config = dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, entropy_fades=fades))
     state = init()

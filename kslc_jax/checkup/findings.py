@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kslc_jax import motors
 from kslc_jax.checkup import statics
 from kslc_jax.config import Config
 from kslc_jax.robot import Robot
@@ -112,7 +113,7 @@ def weak_motors(x: Patient) -> Iterator[Finding]:
 
 def action_scale(x: Patient) -> Iterator[Finding]:
     """Actions that do nothing, or that saturate the motors."""
-    scale = x.config.env.action_scale
+    scale = motors.action_scale(x.config.env, x.train)
     low, high = SCALE
     for names, value in x.both(x.train.kp * scale / x.train.effort_limit):
         if not low <= value <= high:

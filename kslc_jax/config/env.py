@@ -19,6 +19,10 @@ class EnvConfig:
     """Time limit of an episode [s] (HG)."""
     action_scale: float = 0.25
     """Joint target [rad] = default + scale * action (HG)."""
+    least_torque: float = 0.0
+    """Least torque of an action of 1, as a share of the joint's largest torque. A joint whose servo
+    is too soft for that has a larger scale than `action_scale`. Else exploration would hardly show
+    what its motor can do. 0: one scale for all joints (HG)."""
     action_clip: float = 18.0
     """Actions are clipped to [-x, x] (HG)."""
     observation_clip: float = 18.0
@@ -51,7 +55,7 @@ class EnvConfig:
         require(0 <= self.action_delay <= 1, "env.action_delay must lie in [0, 1]")
         require(self.action_clip > 0, "env.action_clip must be positive")
         require(self.observation_clip > 0, "env.observation_clip must be positive")
-        for name in ("action_noise", "noise_level", "reset_joint_noise"):
+        for name in ("least_torque", "action_noise", "noise_level", "reset_joint_noise"):
             require(getattr(self, name) >= 0, f"env.{name} must not be negative")
 
 

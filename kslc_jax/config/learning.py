@@ -93,6 +93,10 @@ class NetworkConfig:
     symmetric: bool = False
     """True: the networks commute with left-right mirroring. A mirrored robot gets the mirrored
     action and the same value. They need half the work of free networks of the same size."""
+    even_inputs: bool = False
+    """True: roll, pitch and joint speeds are multiplied before the first layer. All values of a
+    frame then vary by about as much. Else the networks are slow to learn balance: roll and pitch
+    are the smallest of their inputs."""
     estimator: tuple[int, ...] = ()
     """Widths of the hidden layers of a network that estimates the base's velocity from the actor's
     history. The actor gets the history and the estimate. Empty: no estimator."""

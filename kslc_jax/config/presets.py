@@ -37,6 +37,7 @@ _LAPTOP_LEARNER: dict[str, Any] = {
         "init_std": 0.6,
         "init_mean": 0.01,
         "symmetric": True,
+        "even_inputs": True,
     },
     "ppo": {
         "rollout_steps": 24,
@@ -51,7 +52,7 @@ _LAPTOP_LEARNER: dict[str, Any] = {
 
 _LAPTOP = _override(
     _override(_PAPER, **_LAPTOP_LEARNER),
-    env={"critic_memory": True},
+    env={"critic_memory": True, "least_torque": 0.15},
     network={"estimator": (128, 64)},
     ppo={"entropy_fades": True, "average": 0.98, "value_per_command": True},
     command={
@@ -70,16 +71,15 @@ _LAPTOP = _override(
         "reference_speed_gain": 1.0,
         "stride_sweep": 0.35,
         "arm_swing": 0.38,
-        "arm_swing_slow": 0.2,
+        "arm_swing_slow": 0.25,
         "elbow_bend": 1.0,
         "cycle_from_speed": 0.5,
         "random_phase": True,
     },
     curriculum={
         "settle_seconds": 2.0,
-        "v_limit": 4.5,
+        "v_limit": 4.0,
         "gait_threshold": 0.75,
-        "gait_from": 0.75,
         "top_error": 0.05,
         "top_error_from": 1.75,
         "top_error_floor": 3.0,
@@ -116,10 +116,9 @@ _LAPTOP = _override(
         "default_pose_margin": 0.15,
         "fall": 5.0,
         "exact_full": 2.0,
-        "restless": 0.3,
         "shuffle": 2.0,
         "weights": {
-            "feet_contact_number": 2.0,
+            "feet_contact_number": 3.0,
             "feet_clearance": 0.7,
             "base_height": 0.5,
             "tracking_lin_vel": 2.0,
@@ -127,7 +126,7 @@ _LAPTOP = _override(
             "tracking_mean_vel": 2.0,
             "tracking_ang_vel": 1.5,
             "dof_acc": -3e-7,
-            "dof_vel_limits": -5.0,
+            "dof_vel_limits": -10.0,
             "stand_still": -1.0,
         },
     },
