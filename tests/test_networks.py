@@ -123,7 +123,7 @@ def test_without_an_estimator_nothing_is_estimated():
 
 
 def test_even_inputs_multiply_roll_pitch_and_joint_speeds():
-    """By 8, 8 and 4, before the first layer of all three networks; mirroring holds as before."""
+    """By 8, 8 and 4, before the first layer of all three networks."""
     params = random_params(CONFIG)
     plain = dataclasses.replace(
         CONFIG, network=dataclasses.replace(CONFIG.network, even_inputs=False)
