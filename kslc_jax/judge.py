@@ -318,9 +318,15 @@ def main(argv: list[str] | None = None) -> int:
 
 def _run(args: Args) -> None:
     if args.stored:
-        tables.console().print(side_by_side({path.stem: read(path) for path in args.policies}))
+        tables.console().print(side_by_side(_named(args.policies)))
     else:
         _report(args, args.policies[0])
+
+
+def _named(paths: tuple[Path, ...]) -> dict[str, list[Bar]]:
+    """The bars of each file, by its name; by its path where two files have the same name."""
+    short = len({path.stem for path in paths}) == len(paths)
+    return {path.stem if short else str(path): read(path) for path in paths}
 
 
 def read(path: Path) -> list[Bar]:

@@ -369,6 +369,17 @@ def test_a_robot_with_an_absolute_path_is_not_copied(tmp_path):
         copying.copy(str(tmp_path / "biped.toml"), tmp_path / "robot")
 
 
+def test_the_copy_of_a_robot_keeps_names_beyond_ascii(tmp_path):
+    data = Path(BIPED).parent
+    text = (data / "biped.toml").read_text()
+    assert text.count("biped.xml") == 1
+    (tmp_path / "biped.toml").write_text(text.replace("biped.xml", "röboter.xml"), "utf-8")
+    (tmp_path / "röboter.xml").write_text((data / "biped.xml").read_text())
+    copying.copy(str(tmp_path / "biped.toml"), tmp_path / "robot")
+    copied = description.read(str(tmp_path / "robot" / "biped.toml")).mjcf
+    assert copied == tmp_path / "robot" / "mjcf" / "röboter.xml" and copied.is_file()
+
+
 def test_the_copy_of_a_robot_in_a_package_is_its_description(tmp_path):
     try:
         about = description.read("unitree_g1").path

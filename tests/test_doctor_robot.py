@@ -324,4 +324,4 @@ def test_the_g1(capsys):
     described("unitree_g1")
     assert doctor.main(["robot", "unitree_g1"]) == 0
     said = capsys.readouterr().out
-    assert "actor 74, critic 109" in said and "nothing looks wrong" in said
+    assert "actor 74, critic 117" in said and "nothing looks wrong" in said

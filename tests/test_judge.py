@@ -71,6 +71,22 @@ def test_each_bar_tells_the_worst_and_where(at, changes, name, value):
     assert missed.where == f"{results['speeds'][at]['command']:g} m/s"
 
 
+def test_a_speed_at_which_all_fell_meets_no_bar_on_the_gait():
+    """Such a row has no metrics of the gait: they are not those of the slower speeds."""
+    results = good()
+    results["speeds"][2] = {"command": 3.5, "survival": 0.0, "forward_mean": 0.0}
+    found = {bar.name: bar for bar in bars(results)}
+    for name in (
+        "joints within speed limits, to 3.5 m/s",
+        "arm-leg correlation",
+        "left-right difference",
+        "lateral std, to 3.5 m/s [m/s]",
+        "yaw-rate std, to 3.5 m/s [rad/s]",
+        "flight at 3.5 m/s",
+    ):
+        assert not found[name].met and found[name].where == "3.5 m/s: all fell", name
+
+
 @pytest.mark.parametrize("part", ["schedules", "perturbed"])
 def test_a_fall_under_any_condition_is_told(part):
     results = good()
@@ -221,6 +237,12 @@ def test_seeds_side_by_side(tmp_path, capsys):
     assert "median: c, which misses 1 of 13 bars" in shown
     assert shown.index(" a ") < shown.index(" c ") < shown.index(" b ")
     assert "0.105*" in shown and "0.2*" in shown
+    for name in "ac":
+        (tmp_path / f"in-{name}").mkdir()
+        stored = (tmp_path / f"{name}.json").read_text()
+        (tmp_path / f"in-{name}" / "same.json").write_text(stored)
+    assert judge.main([str(tmp_path / f"in-{name}" / "same.json") for name in "ca"]) == 0
+    assert "misses 1 of 13 bars" in capsys.readouterr().out  # the worse of the two is the median
     (tmp_path / "a.json").write_text("{}")
     assert judge.main([str(tmp_path / "a.json")]) == 2
     assert "no file of a finished judge --json" in capsys.readouterr().err

@@ -4,8 +4,8 @@ It imports no JAX, so a program can read, check and print a config before JAX st
 `rewards.weights` has one field per reward term of `kslc_jax.rewards.TERMS`.
 
 Sources: "paper" is Zhang et al., KSLC (Tables I and II, Eq. 2 to 10). "HG" is Humanoid-Gym: the
-paper builds on it, and it decides what the paper leaves open. docs/fidelity.md explains each
-departure from them.
+paper builds on it, and it decides what the paper leaves open. docs/fidelity.md,
+docs/fidelity_physics.md and docs/laptop_recipe.md explain each departure from them.
 """
 
 from kslc_jax.config.checks import COUNTER, ConfigError, Range, require_seed

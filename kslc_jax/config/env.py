@@ -216,7 +216,7 @@ class RandomizeConfig:
     """Largest push [rad/s], about each axis (HG)."""
     push_adds: bool = True
     """True: a push is added to the base's velocity. False: it replaces the velocity (HG). At
-    3.5 m/s a replaced velocity is like a wall, not like a push."""
+    3.5 m/s a replaced velocity stops the robot almost at once."""
     punch: Range = (0.0, 0.0)
     """Size [N] of a force that acts for 0.08 s at a random link in a random direction, every 4 s.
     0: no punches."""

@@ -94,9 +94,9 @@ class NetworkConfig:
     """True: the networks commute with left-right mirroring. A mirrored robot gets the mirrored
     action and the same value. They need half the work of free networks of the same size."""
     even_inputs: bool = False
-    """True: roll, pitch and joint speeds are multiplied before the first layer. All values of a
-    frame then vary by about as much. Else the networks are slow to learn balance: roll and pitch
-    are the smallest of their inputs."""
+    """True: roll, pitch and joint speeds are multiplied before the first layer. Then all
+    values of a frame vary by similar amounts. Without it the networks are slow to learn balance:
+    roll and pitch are the smallest of their inputs."""
     estimator: tuple[int, ...] = ()
     """Widths of the hidden layers of a network that estimates the base's velocity from the actor's
     history. The actor gets the history and the estimate. Empty: no estimator."""
@@ -127,9 +127,9 @@ class PPOConfig:
     """Lambda of generalised advantage estimation (GAE)."""
     value_per_command: bool = False
     """True: the value of a state is that of holding its present command for ever. A new command
-    then ends the sum of rewards, as a time-out does. Which command comes is random, and is noise to
-    the policy. But it is not paid either for being ready for the next one. False: the value expects
-    new commands (HG)."""
+    then ends the sum of rewards, as a time-out does. The next command is random, so its value is
+    noise to the policy. The policy is then also not paid for being ready for the next command.
+    False: the value expects new commands (HG)."""
     clip: float = 0.2
     """Clipping of the probability ratio and of the change of the value."""
     value_coef: float = 1.0

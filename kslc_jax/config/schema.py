@@ -63,7 +63,7 @@ class Config:
         )
 
     def _check_durations(self) -> None:
-        """Raises ConfigError for a duration that is no number of control steps which fits."""
+        """Raises ConfigError for a duration of half a control step or less, or of 2^31 or more."""
         for name, seconds in {
             "env.episode_seconds": self.env.episode_seconds,
             "command.resample_seconds": self.command.resample_seconds,

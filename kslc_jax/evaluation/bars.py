@@ -127,18 +127,26 @@ def scaled(speed: float, scale: float) -> float:
     return round(speed * scale, 2)
 
 
-Measured = list[tuple[float, str]]
-"""(value, its speed, schedule or condition) of each measurement."""
+Measured = list[tuple[float | None, str]]
+"""(value, its speed, schedule or condition) of each measurement. None: all robots fell there."""
 
 
 def _at_least(name: str, bound: float, measured: Measured) -> Bar:
-    value, where = min(measured, default=(None, "not measured"))
+    value, where = _worst(min, measured)
     return Bar(name, f">= {bound:g}", value, where, value is not None and value >= bound)
 
 
 def _at_most(name: str, bound: float, measured: Measured) -> Bar:
-    value, where = max(measured, default=(None, "not measured"))
+    value, where = _worst(max, measured)
     return Bar(name, f"<= {bound:g}", value, where, value is not None and value <= bound)
+
+
+def _worst(pick: Callable, measured: Measured) -> tuple[float | None, str]:
+    """The worst value and its place. A place where all robots fell is worse than any value."""
+    fallen = [where for value, where in measured if value is None]
+    if fallen:
+        return None, f"{fallen[0]}: all fell"
+    return pick(measured, default=(None, "not measured"))
 
 
 def _between(rows: Iterable[Row], low: float, high: float) -> list[Row]:
@@ -150,8 +158,8 @@ def _place(row: Row) -> str:
 
 
 def _of(rows: Iterable[Row], name: str) -> Measured:
-    """The metric `name` of each row. Rows in which all robots fell lack most metrics."""
-    return [(row[name], _place(row)) for row in rows if name in row]
+    """The metric `name` of each row that has it, and None where all robots fell."""
+    return _each(rows, lambda row: row.get(name))
 
 
 def _upright(rows: Iterable[Row]) -> Measured:
@@ -159,8 +167,8 @@ def _upright(rows: Iterable[Row]) -> Measured:
 
 
 def _each(rows: Iterable[Row], number: Callable[[Row], float | None]) -> Measured:
-    values = [(number(row), _place(row)) for row in rows]
-    return [(value, where) for value, where in values if value is not None]
+    values = [(number(row), _place(row), row["survival"] > 0.0) for row in rows]
+    return [(value, where) for value, where, stands in values if value is not None or not stands]
 
 
 def _by_condition(conditions: dict[str, list[Row]]) -> Measured:

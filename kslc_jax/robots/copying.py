@@ -44,7 +44,9 @@ def copy(name: str, folder: Path) -> None:
     part.mkdir(parents=True)
     if about.path.parent / tomllib.loads(text)["mjcf"] == about.mjcf:  # in no package
         inside = f"{INSIDE}/{_copy_mjcf(about.mjcf, part / INSIDE)}"
-        text = _MJCF_LINE.sub(f"mjcf = {json.dumps(inside)}", text, count=1)
+        line = f"mjcf = {json.dumps(inside)}"
+        # A function: `sub` would read the escapes of a name like "röboter.xml" as a template.
+        text = _MJCF_LINE.sub(lambda _: line, text, count=1)
         if tomllib.loads(text)["mjcf"] != inside:
             raise RobotError(f"{about.path}: write mjcf in one line")
     (part / about.path.name).write_text(text, encoding="utf-8")
