@@ -8,12 +8,14 @@ l = m = 1, and its presets stay as they are. docs/own_robot.md explains each rul
 
 import dataclasses
 import math
+import typing
 from functools import reduce
 from typing import Any
 
 from kslc_jax import config as config_lib
 from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config, ConfigError
+from kslc_jax.config.storage import valid
 from kslc_jax.robot import Robot
 from kslc_jax.robots import description
 
@@ -140,18 +142,12 @@ def _changed(config: Any, changes: dict[str, Any], where: str) -> Any:
             raise ConfigError(f"{where}: unknown field {name!r}; there are {', '.join(names)}")
         old = getattr(config, name)
         if "" in parts:
-            new[name] = _checked(old, parts[""], f"{where}: {name}")
+            if name == "robot" or dataclasses.is_dataclass(old):
+                raise ConfigError(f"{where}: {name}: {parts['']!r} is not a valid value")
+            hint = typing.get_type_hints(type(config))[name]
+            new[name] = valid(hint, parts[""], f"{where}: {name}")
         elif dataclasses.is_dataclass(old):
             new[name] = _changed(old, parts, where)
         else:
             raise ConfigError(f"{where}: {name!r} has no field {next(iter(parts))!r}")
     return dataclasses.replace(config, **new)
-
-
-def _checked(old: Any, value: Any, where: str) -> Any:
-    """The new value of a field, of the type of the old one."""
-    if isinstance(old, float) and type(value) is int:
-        value = float(value)
-    if type(value) is not type(old) or dataclasses.is_dataclass(old):
-        raise ConfigError(f"{where}: {value!r} is not a valid value")
-    return value

@@ -125,9 +125,18 @@ def test_a_description_overrides_the_scaled_config(tmp_path):
 
     c = similar.preset("laptop", described('"gait.reference_scale" = 0.2'))
     assert c.gait.reference_scale == 0.2 and c.curriculum.v_limit < 4.5
+    c = similar.preset("laptop", described("[config.gait]\nreference_scale = 1\narm_swing = 0.1"))
+    assert (c.gait.reference_scale, c.gait.arm_swing) == (1.0, 0.1)
+    assert isinstance(c.gait.reference_scale, float)
     for line, says in (
         ('"gait.reference" = 0.2', "unknown field 'reference'"),
-        ('"gait.reference_scale" = "much"', "'much' is not a valid value"),
+        ('"gait.reference_scale" = "much"', '"much" is not a valid value'),
+        ('"gait.reference_scale" = true', "true is not a valid value"),
+        ('"physics.engine" = "quick"', '"quick" is not a valid value'),
+        ('"physics.robot" = "xbot_l"', "'xbot_l' is not a valid value"),
+        ('"command.vy" = [-0.2, 0.2, 0.3]', "is not a valid value"),
+        ('"randomize.punch" = [0]', "is not a valid value"),
+        ('"network.actor" = ["512"]', '"512" is not a valid value'),
         ('"gait.reference_scale.left" = 1', "has no field 'left'"),
     ):
         with pytest.raises(config.ConfigError, match=says):

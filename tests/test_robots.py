@@ -547,11 +547,11 @@ ROBOTS = {
     "no shoe": ({"xml": ((SHOE, MASS),)}, "the foot below joint 'port_rudder' has no shapes"),
     "no gains": (
         {"xml": (('<position joint="mast"/>', ""),)},
-        "joint 'mast' has no kp, kd, effort",
+        "joint 'mast': no kp, kd, effort",
     ),
     "line to add": (
         {"xml": (('<position joint="mast"/>', ""),)},
-        '"mast" = { kp = ..., kd = ..., ',
+        '"^(mast)$" = { kp = ..., kd = ..., ',
     ),
     "home pattern": (
         {"toml": "[home]\nelbow = 1\n"},
@@ -600,6 +600,18 @@ ROBOTS = {
         "weld: not with prepared",
     ),
 }
+
+
+def test_all_missing_values_of_motors_are_told_at_once(tmp_path):
+    path = tmp_path / "robot.toml"
+    path.write_text(f"mjcf = '{BIPED.replace('.toml', '.xml')}'")
+    with pytest.raises(RobotError) as refused:
+        build.spec(description.read(str(path)), "train")
+    assert str(refused.value).endswith(
+        "joints 'port_cant', 'star_cant': no kp, kd, speed; add under [motors]: "
+        '"^(mast|port_sheet|port_lock|port_rudder|star_sheet|star_lock|star_rudder)$" = '
+        '{ speed = ... } and "^(port_cant|star_cant)$" = { kp = ..., kd = ..., speed = ... }'
+    )
 
 
 @pytest.mark.parametrize("case", ROBOTS)

@@ -87,11 +87,15 @@ def _build(cls: Any, data: Any, where: str) -> Any:
     data = {n: value for n, value in data.items() if f"{where}.{n}" not in REMOVED_FIELDS}
     unknown = set(data) - set(hints)
     require(not unknown, f"{where}: unknown field {', '.join(sorted(unknown))}")
-    return cls(**{n: _value(hints[n], data[n], f"{where}.{n}") for n in data})
+    return cls(**{n: valid(hints[n], data[n], f"{where}.{n}") for n in data})
 
 
-def _value(hint: Any, value: Any, where: str) -> Any:
-    """Checks one value against its type annotation and converts it."""
+def valid(hint: Any, value: Any, where: str) -> Any:
+    """`value` as the type `hint` of its field: a list becomes a tuple, an int a float.
+
+    Raises:
+      ConfigError: `value` is not of that type. The message begins with `where`.
+    """
     wrong = f"{where}: {json.dumps(value, default=str)} is not a valid value"
     origin = typing.get_origin(hint)
     if dataclasses.is_dataclass(hint):
@@ -103,7 +107,7 @@ def _value(hint: Any, value: Any, where: str) -> Any:
         require(isinstance(value, list | tuple), wrong)
         args = typing.get_args(hint)
         require(args[-1] is Ellipsis or len(value) == len(args), wrong)
-        return tuple(_value(args[0], v, where) for v in value)
+        return tuple(valid(args[0], v, where) for v in value)
     if hint is float:
         require(isinstance(value, int | float) and not isinstance(value, bool), wrong)
         return float(value)

@@ -19,6 +19,7 @@ import math
 import os
 import re
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -147,12 +148,21 @@ def _value(path: Path, field: str, value: Any) -> Any:
         return tuple(value)
     table = _typed(path, field, value, dict, "a table")
     if field == "config":
-        return tuple((k, tuple(v) if isinstance(v, list) else v) for k, v in table.items())
+        return tuple(_flat(table))
     parse = _motor if field == "motors" else _number
     return tuple(
         (_pattern(path, field, pattern), parse(path, f"{field}.{pattern}", entry))
         for pattern, entry in table.items()
     )
+
+
+def _flat(table: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, object]]:
+    """(dotted name, hashable value) of each entry of a table and of the tables in it."""
+    for name, value in table.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", tuple(value) if isinstance(value, list) else value
 
 
 def _typed(path: Path, field: str, value: Any, kind: type, words: str) -> Any:

@@ -49,7 +49,7 @@ def motors(description: Description, model: mujoco.MjModel, joints: list[int]) -
       joints: ids in `model` of the joints that have a motor.
 
     Raises:
-      RobotError: a motor lacks a value; the message has the line to add.
+      RobotError: motors lack values; the message has the lines to add for all of them.
     """
     names = joint_names(model)
     found = {joint: _of_mjcf(model, joint) for joint in joints}
@@ -57,15 +57,28 @@ def motors(description: Description, model: mujoco.MjModel, joints: list[int]) -
         if i + 1 in found:  # others are welded
             values = {k: v for k, v in asdict(given).items() if v is not None}
             found[i + 1] = replace(found[i + 1], **values)
-    for joint, motor in found.items():
-        missing = [field for field in _REQUIRED if getattr(motor, field) is None]
-        if missing:
-            name, line = names[joint - 1], ", ".join(f"{field} = ..." for field in missing)
-            raise RobotError(
-                f"{description.path}: motors: joint {name!r} has no {', '.join(missing)}; "
-                f'add under [motors]: "{name}" = {{ {line} }}'
-            )
+    _require_complete(description, {names[joint - 1]: motor for joint, motor in found.items()})
     return list(found.values())
+
+
+def _require_complete(description: Description, found: dict[str, Motor]) -> None:
+    """Refuses motors that lack a value. Joints that lack the same values are told together."""
+    lacking: dict[tuple[str, ...], list[str]] = {}
+    for name, motor in found.items():
+        missing = tuple(field for field in _REQUIRED if getattr(motor, field) is None)
+        if missing:
+            lacking.setdefault(missing, []).append(name)
+    if not lacking:
+        return
+    told, lines = [], []
+    for missing, joints in lacking.items():
+        word = "joint" if len(joints) == 1 else "joints"
+        told.append(f"{word} {', '.join(map(repr, joints))}: no {', '.join(missing)}")
+        pattern = "." if len(joints) == len(found) else f"^({'|'.join(joints)})$"
+        lines.append(f'"{pattern}" = {{ {", ".join(f"{field} = ..." for field in missing)} }}')
+    raise RobotError(
+        f"{description.path}: motors: {'; '.join(told)}; add under [motors]: {' and '.join(lines)}"
+    )
 
 
 def _of_mjcf(model: mujoco.MjModel, joint: int) -> Motor:
