@@ -39,7 +39,7 @@ class Bar:
 
     name: str
     wanted: str
-    value: float | None  # the worst measured value; None if nothing was measured
+    value: float | None  # the worst value; None if nothing was measured, or all robots fell
     where: str  # speed, schedule or condition of the worst value
     met: bool
 
