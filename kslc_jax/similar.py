@@ -142,6 +142,7 @@ def _changed(config: Any, changes: dict[str, Any], where: str) -> Any:
             raise ConfigError(f"{where}: unknown field {name!r}; there are {', '.join(names)}")
         old = getattr(config, name)
         if "" in parts:
+            # A description is the robot: it cannot name another one.
             if name == "robot" or dataclasses.is_dataclass(old):
                 raise ConfigError(f"{where}: {name}: {parts['']!r} is not a valid value")
             hint = typing.get_type_hints(type(config))[name]
