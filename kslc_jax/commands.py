@@ -1,5 +1,7 @@
 """Commanded velocity and heading of one environment."""
 
+import math
+
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -60,7 +62,7 @@ def sample(
     vy = draws.between(sideways, *config.vy)
     heading = draws.between(turn, *config.heading)
     if config.narrow_speed > 0:
-        share = jnp.clip(1.0 - jnp.abs(vx) / config.narrow_speed, 0.0, 1.0)
+        share = width(config, vx)
         vy = vy * share
         heading = yaw + share * maths.wrap_angle(heading - yaw)
 
@@ -77,6 +79,20 @@ def sample(
     heading = jnp.where(forward, yaw, heading)
     wanted = with_velocity(config, before, jnp.stack([vx, vy, jnp.zeros(())]))
     return steer(config, wanted.replace(heading=heading), yaw, 0.0)
+
+
+def width(config: CommandConfig, vx: jax.Array | float) -> jax.Array:
+    """Share [] of the ranges of vy and of heading changes from which commands with vx [m/s] are."""
+    if config.narrow_speed == 0:
+        return jnp.ones(())
+    return jnp.clip(1.0 - jnp.abs(vx) / config.narrow_speed, 0.0, 1.0)
+
+
+def widest(config: CommandConfig, vx: float) -> tuple[float, float, float]:
+    """Least and largest vy [m/s], and largest yaw rate [rad/s], that `sample` asks for with vx."""
+    share = float(width(config, vx))
+    rate = min(config.max_yaw_rate, config.heading_gain * share * math.pi)
+    return share * config.vy[0], share * config.vy[1], rate
 
 
 def holding_steps(config: CommandConfig, key: jax.Array, control_dt: float) -> jax.Array:

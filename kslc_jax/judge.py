@@ -181,7 +181,8 @@ def _speeds(size: Size, args: Args, policy, progress: Progress) -> list[dict[str
     def told(share: float) -> None:
         progress("speeds", share)
 
-    return measured(policy, plain, size.speeds, size.seeds, args.seed, told)
+    rows = measured(policy, plain, size.speeds, size.seeds, args.seed, told)
+    return _marked(rows, policy, plain)
 
 
 def robots_that_differ(name: str) -> RandomizeConfig:
@@ -272,7 +273,15 @@ def _tried(
     engine = trials.engine(policy, "high", made.pop("terrain", None))
     plain = trials.Setting(engine, seconds=seconds)
     setting = dataclasses.replace(plain, **settings(made, plain.randomize))
-    return measured(policy, setting, speeds, seeds, args.seed, told, speed)
+    rows = measured(policy, setting, speeds, seeds, args.seed, told, speed)
+    return _marked(rows, policy, setting)
+
+
+def _marked(rows: list[dict[str, Any]], policy, setting) -> list[dict[str, Any]]:
+    """The rows, each with the reasons of `trained.beyond`."""
+    from kslc_jax.evaluation import trained
+
+    return [row | trained.beyond(policy, setting, (row["command"], 0.0, 0.0)) for row in rows]
 
 
 def _drake(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
@@ -297,11 +306,12 @@ PARTS = {
 
 
 def table(found: list[Bar], title: str):
-    """The bars as a rich table."""
+    """The bars as a rich table. An asterisk marks conditions beyond the training."""
     from rich.markup import escape
     from rich.table import Table
 
-    out = Table(title=title, title_justify="left")
+    caption = tables.BEYOND if any("*" in bar.where for bar in found) else None
+    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for label in ("bar", "wanted", "worst", "where", "met"):
         out.add_column(label)
     for bar in found:
@@ -323,29 +333,33 @@ def _run(args: Args) -> None:
         _report(args, args.policies[0])
 
 
-def _named(paths: tuple[Path, ...]) -> dict[str, list[Bar]]:
-    """The bars of each file, by its name; by its path where two files have the same name."""
+def _named(paths: tuple[Path, ...]) -> dict[str, Results]:
+    """The content of each file, by its name; by its path where two files have the same name."""
     short = len({path.stem for path in paths}) == len(paths)
     return {path.stem if short else str(path): read(path) for path in paths}
 
 
-def read(path: Path) -> list[Bar]:
-    """The bars of a file of --json. ConfigError if there is none, or if it has no bars."""
+def read(path: Path) -> Results:
+    """The content of a file of --json. ConfigError if there is none, or if it has no bars."""
     try:
-        return [Bar(**bar) for bar in json.loads(path.read_text())["bars"]]
+        kept: Results = json.loads(path.read_text())
+        return kept | {"bars": [Bar(**bar) for bar in kept["bars"]]}
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"{path} is no file of a finished judge --json") from error
 
 
-def side_by_side(judged: dict[str, list[Bar]]):
+def side_by_side(kept: dict[str, Results]):
     """The worst values of several policies as a rich table, the best policy first."""
     from rich.markup import escape
     from rich.table import Table
 
+    judged: dict[str, list[Bar]] = {name: one["bars"] for name, one in kept.items()}
     names = bars_lib.ranked(judged)
     median = names[len(names) // 2]
     missed = sum(not bar.met for bar in judged[median])
     caption = f"median: {median}, which misses {missed} of {len(judged[median])} bars. *: missed"
+    if differ := _unlike(list(kept.values())):
+        caption += f"\nNot comparable: the files differ in {', '.join(differ)}."
     out = Table("bar", "wanted", *map(escape, names), caption=caption, caption_justify="left")
     by_name = {name: {bar.name: bar for bar in judged[name]} for name in names}
     for bar in judged[names[0]]:
@@ -353,6 +367,15 @@ def side_by_side(judged: dict[str, list[Bar]]):
         cells = ["-" if one is None else one.shown() + "*" * (not one.met) for one in found]
         out.add_row(escape(bar.name), bar.wanted, *cells)
     return out
+
+
+def _unlike(kept: list[Results]) -> list[str]:
+    """Names of the conditions that differ between the contents of files of --json."""
+    conditions = [one.get("size", {}) | {k: one.get(k) for k in ("robot", "seed")} for one in kept]
+    names = dict.fromkeys(name for one in conditions for name in one)
+    return [
+        name for name in names if any(c.get(name) != conditions[0].get(name) for c in conditions)
+    ]
 
 
 def _report(args: Args, path: Path) -> None:
@@ -371,7 +394,7 @@ def _report(args: Args, path: Path) -> None:
     options.require_engine(engine, robot)
     size, factors = args.size.for_robot(robot), similar.factors(robot)
     about: Results = {"policy": policy_name(path), "step": policy.step, "quick": args.quick}
-    about |= {"seed": args.seed, "size": dataclasses.asdict(size)}
+    about |= {"robot": robot.name, "seed": args.seed, "size": dataclasses.asdict(size)}
 
     def keep(found: Results) -> None:
         if args.json is not None:

@@ -90,7 +90,16 @@ def test_fast_commands_are_narrow(vx, vy, heading):
     assert float(command.heading) == pytest.approx(heading, abs=1e-6)
 
 
-def test_narrowing_turns_the_short_way():
+@pytest.mark.parametrize("vx", [0.0, -1.0, 2.0, 3.5, 5.0])
+@pytest.mark.parametrize("narrow", [0.0, 4.0])
+def test_no_command_is_wider_than_the_widest(vx, narrow):
+    """Commands of the largest vy and with headings all around come as close to it as drawn."""
+    config = dataclasses.replace(PAPER, vy=(0.3, 0.3), heading_gain=0.2, narrow_speed=narrow)
+    velocity = np.abs(draw_many(config, vx=(vx, vx)).velocity)
+    _, left, turn = commands.widest(config, vx)
+    np.testing.assert_allclose(velocity[:, 1], left, atol=1e-6)
+    assert 0.98 * turn <= velocity[:, 2].max() <= turn + 1e-6
+
     """The short way from yaw 3 to heading -3 is 0.2831853 rad; half of it is added to 3."""
     command = draw(2.0, 0.0, -3.0, 3.0, narrow_speed=4.0)
     assert float(command.heading) == pytest.approx(3.1415927, abs=1e-6)

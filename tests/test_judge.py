@@ -9,7 +9,7 @@ import pytest
 from kslc_jax import judge, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.evaluation import measure as measuring
-from kslc_jax.evaluation import scheduled, variation
+from kslc_jax.evaluation import scheduled, tables, variation
 from kslc_jax.evaluation.bars import HARSH, bars
 
 
@@ -246,6 +246,54 @@ def test_seeds_side_by_side(tmp_path, capsys):
     (tmp_path / "a.json").write_text("{}")
     assert judge.main([str(tmp_path / "a.json")]) == 2
     assert "no file of a finished judge --json" in capsys.readouterr().err
+
+
+def test_files_of_other_conditions_are_not_comparable(tmp_path, capsys):
+    stored = [dataclasses.asdict(bar) for bar in bars(good())]
+    alike = {"robot": "xbot_l", "seed": 0, "size": {"seeds": 32, "seconds": 60.0}, "bars": stored}
+    others = {
+        "a": alike,
+        "b": alike | {"policy": "another", "step": 9},
+        "fewer": alike | {"size": {"seeds": 4, "seconds": 60.0}},
+        "small": alike | {"robot": "biped", "seed": 1},
+    }
+    for name, kept in others.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(kept))
+
+    def told(*names):
+        assert judge.main([str(tmp_path / f"{name}.json") for name in names]) == 0
+        return capsys.readouterr().out
+
+    assert "Not comparable" not in told("a", "b")
+    assert "the files differ in seeds." in told("a", "b", "fewer")
+    assert "the files differ in robot, seed." in told("small", "a")
+
+
+def test_what_lies_beyond_the_training_is_marked(monkeypatch):
+    """The shipped policy was not trained with punches of 500 N. The table says so."""
+
+    def measure(policy, setting, speeds, seeds, seed, progress, describe=None):
+        return [row(speed, survival=0.5) for speed in speeds]
+
+    monkeypatch.setattr(measuring, "measure", measure)
+    policy = policy_lib.load_policy("xbot_l_run")
+    args = judge.Args((Path("p"),), harsh=True)
+
+    def told(name, share):
+        pass
+
+    parts = {
+        "speeds": judge._speeds(judge.FULL, args, policy, told),
+        "perturbed": judge._perturbed(judge.FULL, args, policy, told),
+        "harsh": judge._harsh(judge.FULL, args, policy, told),
+    }
+    assert parts["harsh"]["punch=500"]["rows"][0]["beyond"] == ["punch"]
+    assert "beyond" not in parts["speeds"][1] and "beyond" not in parts["perturbed"]["payload=5"][0]
+    found = {bar.name: bar for bar in bars(good() | parts)}
+    assert found["share that does not fall, punch=500"].where == "0 m/s*"
+    shown = judge.table(list(found.values()), "title")
+    assert shown.caption == tables.BEYOND
+    assert judge.table(bars(good()), "title").caption is None
 
 
 def test_errors_are_one_line(capsys):

@@ -236,7 +236,9 @@ def test_what_lies_beyond_the_training_is_named(still):
     def robots(**changes):
         return reasons(randomize=dataclasses.replace(trials.NOMINAL, **changes))
 
-    assert reasons() == [] and reasons((v_max, 0.3, 1.0)) == []
+    assert reasons() == [] and reasons((v_max, 0.26, 1.0)) == []
+    # At v_max, 0.5 m/s, vy has 1 - 0.5 / 4 of its range: 0.2625 m/s.
+    assert reasons((v_max, 0.27, 1.0)) == ["sideways"] and reasons((0.0, 0.3, 1.0)) == []
     assert reasons((v_max + 0.5, 0.4, 1.5)) == ["speed", "sideways", "turn"]
     assert robots(base_mass=(5.0, 5.0)) == [] and robots(base_mass=(8.0, 8.0)) == ["base_mass"]
     assert robots(friction=(0.3, 0.3), ground_friction=0.3) == ["friction"]

@@ -40,7 +40,7 @@ class Bar:
     name: str
     wanted: str
     value: float | None  # the worst value; None if nothing was measured, or all robots fell
-    where: str  # speed, schedule or condition of the worst value
+    where: str  # speed, schedule or condition of the worst value; *: beyond the training
     met: bool
 
     def shown(self) -> str:
@@ -154,7 +154,8 @@ def _between(rows: Iterable[Row], low: float, high: float) -> list[Row]:
 
 
 def _place(row: Row) -> str:
-    return f"{row['command']:g} m/s" if "command" in row else row["schedule"]
+    name = f"{row['command']:g} m/s" if "command" in row else row["schedule"]
+    return name + "*" * ("beyond" in row)
 
 
 def _of(rows: Iterable[Row], name: str) -> Measured:

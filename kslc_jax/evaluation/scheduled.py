@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from kslc_jax.evaluation import reaction, trained, trials
+from kslc_jax.evaluation import reaction, tables, trained, trials
 from kslc_jax.evaluation.schedules import Schedule
 from kslc_jax.policy import Policy
 
@@ -67,7 +67,7 @@ def table(results: dict[str, list[dict[str, Any]]], title: str):
 
     caption = None
     if any("beyond" in row for rows in results.values() for row in rows):
-        caption = "* beyond what the policy was trained for, see 'beyond' in the JSON"
+        caption = tables.BEYOND
     out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     out.add_column("condition")
     out.add_column("schedule")

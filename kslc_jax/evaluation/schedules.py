@@ -129,8 +129,7 @@ def _turns(config: CommandConfig, top: float) -> tuple[Step, ...]:
     steps = []
     for share in TURNS:
         vx = share * top
-        widest = math.pi * (max(0.0, 1.0 - vx / config.narrow_speed) if config.narrow_speed else 1)
-        rate = min(config.max_yaw_rate, config.heading_gain * widest)
+        *_, rate = commands.widest(config, vx)
         steps += [Step(3.0, vx), Step(3.0, vx, yaw_rate=rate), Step(3.0, vx, yaw_rate=-rate)]
     return tuple(steps)
 

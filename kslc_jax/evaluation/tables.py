@@ -39,6 +39,9 @@ SIDEWAYS_COLUMNS: Columns = (
 )
 """Columns for commands with a side step or a turn. They add mean vy and mean yaw rate."""
 
+BEYOND = "* beyond what the policy was trained for; 'beyond' in the JSON says what"
+"""Caption of a table with marked rows."""
+
 
 def speed(command: float) -> str:
     """A commanded speed [m/s] with one digit, or with as many as it has: 0.5, 0.45."""
@@ -47,8 +50,7 @@ def speed(command: float) -> str:
 
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
     """A table with one line per commanded speed. An asterisk marks rows with the entry `beyond`."""
-    marked = any("beyond" in row for row in rows)
-    caption = "* beyond what the policy was trained for" if marked else None
+    caption = BEYOND if any("beyond" in row for row in rows) else None
     out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for label in ("command [m/s]", *(label for _, label, _ in columns)):
         out.add_column(escape(label), justify="right")  # rich would read [m/s] as a style

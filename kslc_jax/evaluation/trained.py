@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+from kslc_jax import commands
 from kslc_jax.config import GROUNDS, Config, RandomizeConfig, TerrainConfig
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Schedule
@@ -57,17 +58,19 @@ def _pace(schedule: Schedule) -> float:
 
 
 def _command_reasons(trained: Config, v_max: float, asked) -> list[str]:
-    low, (right, left) = trained.curriculum.v_min, trained.command.vy
-    spans = {
-        "speed": (0, low, v_max),
-        "sideways": (1, right, left),
-        "turn": (2, -trained.command.max_yaw_rate, trained.command.max_yaw_rate),
-    }
-    return [
-        name
-        for name, (at, low, high) in spans.items()
-        if any(not low - TOLERANCE <= one[at] <= high + TOLERANCE for one in asked)
-    ]
+    """ "speed", "sideways" and "turn", as far as one of the commands asks for more."""
+    found = set()
+    for vx, vy, yaw_rate in asked:
+        right, left, turn = commands.widest(trained.command, vx)
+        spans = {
+            "speed": (vx, trained.curriculum.v_min, v_max),
+            "sideways": (vy, right, left),
+            "turn": (yaw_rate, -turn, turn),
+        }
+        for name, (value, low, high) in spans.items():
+            if not low - TOLERANCE <= value <= high + TOLERANCE:
+                found.add(name)
+    return [name for name in ("speed", "sideways", "turn") if name in found]
 
 
 def _robot_reasons(trained: RandomizeConfig, tried: RandomizeConfig) -> list[str]:
