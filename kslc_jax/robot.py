@@ -59,6 +59,7 @@ class Robot:
     knees_apart: float  # m, distance of the knees at home
     mass_ratio: float  # total mass by XBot-L's
     length_ratio: float  # standing height by XBot-L's
+    files_changed: int  # ns since 1970, see build.changed_at
 
     @property
     def count(self) -> int:
@@ -126,7 +127,7 @@ def load(
     name: str = XBOT_L,
     terrain: TerrainConfig | None = None,
 ) -> Robot:
-    """Compiles a robot's model and reads its facts (cached).
+    """Compiles a robot's model and reads its facts (cached: a training keeps its robot).
 
     Args:
       fidelity: "train" or "high".
@@ -139,7 +140,8 @@ def load(
     Raises:
       RobotError: no such robot, or one that cannot be used.
     """
-    spec = build.spec(description.read(name), fidelity)
+    about = description.read(name)
+    files_changed, spec = build.changed_at(about), build.spec(about, fidelity)
     model = _on_ground(spec, fidelity, terrain) if terrain else spec.compile()
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
@@ -192,6 +194,7 @@ def load(
         knees_apart=_apart(at_home, "knee_pos"),
         mass_ratio=mass / xbot.total_mass if xbot else 1.0,
         length_ratio=stand_height / xbot.stand_height if xbot else 1.0,
+        files_changed=files_changed,
     )
 
 

@@ -17,7 +17,7 @@ from kslc_jax import robot as robot_lib
 from kslc_jax.config import Config, ConfigError
 from kslc_jax.config.storage import valid
 from kslc_jax.robot import Robot
-from kslc_jax.robots import description
+from kslc_jax.robots import build, description
 
 DIGITS = 3
 """Significant digits of a scaled number: more would claim an accuracy that similarity lacks."""
@@ -33,12 +33,19 @@ def preset(name: str, robot: str = config_lib.XBOT_L, without: tuple[str, ...] =
 
     Raises:
       ConfigError: unknown preset, ablation or field, or a value that cannot work.
-      RobotError: unknown robot, or one that cannot be used.
+      RobotError: unknown robot, one that cannot be used, or one whose files changed after this
+        process had loaded it.
     """
     about, config = description.read(robot), config_lib.preset(name, without)
     where = robot if robot in description.known() else str(about.path)
     physics = dataclasses.replace(config.physics, robot=where)
-    config = scaled(dataclasses.replace(config, physics=physics), robot_lib.load(name=where))
+    loaded = robot_lib.load(name=where)
+    if loaded.files_changed != build.changed_at(about):
+        raise description.RobotError(
+            f"{about.path}: a file of this robot changed after this process had loaded it; start "
+            "Python again (in a notebook: restart the kernel)"
+        )
+    config = scaled(dataclasses.replace(config, physics=physics), loaded)
     return _changed(config, dict(about.config), f"{about.path}: config")
 
 

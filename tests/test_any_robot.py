@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import os
 import runpy
 import shutil
 import subprocess
@@ -358,12 +359,47 @@ def test_a_training_keeps_its_robot(mine, tmp_path):
     with pytest.raises(config.ConfigError, match=f"copy the folder robot of its run to {run}"):
         run_folder.read_config(run)
     (run / "robots").rename(run / "robot")
-    stronger = home / "stronger" / "biped.toml"  # in another place: descriptions are cached
+    stronger = home / "stronger" / "biped.toml"  # in another place: robots are cached
     stronger.parent.mkdir()
     stronger.write_text(about.read_text().replace("kp = 60", "kp = 66"))
     engine = dataclasses.replace(setup.physics, robot=str(stronger))
     with pytest.raises(config.ConfigError, match=r"biped.toml has changed since .* 60 -> 66"):
         same_training.difference(kept, dataclasses.replace(setup, physics=engine))
+
+
+@pytest.mark.parametrize("file", ["biped.toml", "biped.xml", "part.xml"])
+def test_a_robot_that_changed_needs_a_new_process(tmp_path, file):
+    """Compiled programs keep the robot's numbers. So the old ones are not used without a word."""
+    data = Path(BIPED).parent
+    (tmp_path / "biped.toml").write_text((data / "biped.toml").read_text())
+    (tmp_path / "part.xml").write_text("<mujoco><visual/></mujoco>")
+    text = (data / "biped.xml").read_text()
+    (tmp_path / "biped.xml").write_text(
+        text.replace("<compiler ", '<include file="part.xml"/><compiler ', 1)
+    )
+    mine = str(tmp_path / "biped.toml")
+    before = similar.preset("debug", mine)
+    assert similar.preset("debug", mine) == before
+    changed = tmp_path / file
+    os.utime(changed, ns=(0, changed.stat().st_mtime_ns + 10**9))
+    with pytest.raises(RobotError, match=r"biped.toml: a file of this robot changed after this"):
+        similar.preset("debug", mine)
+
+
+def test_a_faulty_robot_can_be_mended(tmp_path):
+    """What could not be loaded is read again."""
+    data = Path(BIPED).parent
+    good = (data / "biped.toml").read_text()
+    shutil.copyfile(data / "biped.xml", tmp_path / "biped.xml")
+    mine = tmp_path / "biped.toml"
+    mine.write_text(good.replace('mjcf = "biped.xml"', 'mjcf = "biped.xm"'))
+    with pytest.raises(RobotError, match="no such file"):
+        similar.preset("debug", str(mine))
+    mine.write_text("stand_height = -1\n" + good)
+    with pytest.raises(RobotError):
+        similar.preset("debug", str(mine))
+    mine.write_text(good)
+    assert similar.preset("debug", str(mine)).physics.robot == str(mine)
 
 
 def test_a_robot_with_an_absolute_path_is_not_copied(tmp_path):

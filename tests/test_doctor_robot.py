@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from packages import described
 
-from kslc_jax import doctor, robot, similar
+from kslc_jax import doctor, robot
 from kslc_jax.checkup import findings, picture, report, statics, trials
 from kslc_jax.checkup.findings import Patient
+from kslc_jax.config import PhysicsConfig
 from kslc_jax.errors import UserError
 from kslc_jax.robots import description
 
@@ -19,20 +20,14 @@ DATA = Path(__file__).parent / "data"
 BIPED = str(DATA / "biped.toml")
 
 
-def patient(name: str) -> Patient:
-    return Patient(
-        robot.load(name=name), robot.load("high", name=name), similar.preset("laptop", name)
-    )
-
-
 @pytest.fixture(scope="module")
 def biped() -> Patient:
-    return patient(BIPED)
+    return report.patient(BIPED)
 
 
 @pytest.fixture(scope="module")
 def xbot_l() -> Patient:
-    return patient("xbot_l")
+    return report.patient("xbot_l")
 
 
 def broken(folder: Path, toml: str = "", *xml: tuple[str, str]) -> Patient:
@@ -44,7 +39,7 @@ def broken(folder: Path, toml: str = "", *xml: tuple[str, str]) -> Patient:
         mjcf = mjcf.replace(old, new)
     (folder / "biped.xml").write_text(mjcf)
     (folder / "robot.toml").write_text(text + toml)
-    return patient(str(folder / "robot.toml"))
+    return report.patient(str(folder / "robot.toml"))
 
 
 # --------------------------------------------------------------------------------------- derived
@@ -122,7 +117,7 @@ def static_findings(x: Patient) -> list[findings.Finding]:
 
 @pytest.mark.parametrize("name", ["xbot_l", BIPED])
 def test_nothing_is_wrong_with_these(name):
-    assert static_findings(patient(name)) == []
+    assert static_findings(report.patient(name)) == []
 
 
 CASES = {
@@ -273,9 +268,17 @@ def test_sag_is_the_weight_of_the_limbs_over_kp(biped):
     assert np.abs(sag).max() > 5e-3
 
 
+def test_trials_have_the_physics_of_training(tmp_path):
+    """[config] counts, and the ground is flat for the checks."""
+    physics = "timestep = 0.0025\ndecimation = 4\niterations = 7\n"
+    it = broken(tmp_path, f"[config.physics]\n{physics}terrain.rough = 0.02\n").train
+    assert it.mj_model.opt.timestep == 0.0025 and it.mj_model.opt.iterations == 7
+    assert it.terrain is None and math.isfinite(trials.fall_time(it))
+
+
 @pytest.mark.slow(reason="compiles MJX")
 def test_engines_agree_on_the_biped():
-    assert trials.engines_apart(BIPED) < findings.AGREEMENT
+    assert trials.engines_apart(PhysicsConfig(robot=BIPED)) < findings.AGREEMENT
 
 
 # ---------------------------------------------------------------------------------------- command

@@ -661,7 +661,6 @@ def test_a_robot_of_menagerie_is_downloaded_and_what_fails_is_one_line(tmp_path,
         ("lost/biped.xml", "found no lost/biped.xml (no network: try again)"),
         ("ship/other.xml", "found no ship/other.xml"),
     ):
-        path = tmp_path / f"{inside[:4]}.toml"  # in another place: descriptions are cached
         path.write_text(f'mjcf = "menagerie:{inside}"')
         with pytest.raises(RobotError) as refused:
             description.read(str(path))

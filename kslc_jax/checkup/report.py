@@ -1,5 +1,6 @@
 """The checks of a robot, in their order, and their results as text."""
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,9 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from kslc_jax import observations, robot, similar
+from kslc_jax import observations, physics, robot, similar
 from kslc_jax.checkup import findings, picture, statics, trials
 from kslc_jax.checkup.findings import Finding, Patient
+from kslc_jax.config import PhysicsConfig, TerrainConfig
 from kslc_jax.robot import Robot
 from kslc_jax.robots.build import SIDES
 
@@ -38,9 +40,7 @@ def check(name: str, out: Path | None, engines: bool) -> None:
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = PLAIN_WIDTH
-    config = similar.preset("laptop", name)
-    where = config.physics.robot
-    x = Patient(robot.load(name=where), robot.load("high", name=where), config)
+    x = patient(name)
     console.print(geometry(x.train), motors(x.train), facts(x))
     if out:
         picture.draw(x.high, out)
@@ -48,8 +48,19 @@ def check(name: str, out: Path | None, engines: bool) -> None:
     found = [finding for look in findings.STATIC for finding in look(x)]
     found += _try(console, x)
     if engines:
-        found += _compare(console, where)
+        found += _compare(console, _on_flat(x.config.physics))
     console.print(verdict(found))
+
+
+def patient(name: str) -> Patient:
+    """The robot of this name or description, with the physics step of its laptop preset."""
+    config = similar.preset("laptop", name)
+    high = robot.load("high", name=config.physics.robot)
+    return Patient(physics.robot_for(_on_flat(config.physics)), high, config)
+
+
+def _on_flat(config: PhysicsConfig) -> PhysicsConfig:
+    return dataclasses.replace(config, terrain=TerrainConfig())
 
 
 def _try(console: Console, x: Patient) -> Iterator[Finding]:
@@ -73,10 +84,10 @@ def _try(console: Console, x: Patient) -> Iterator[Finding]:
     yield from findings.passive(falls[0], trials.STAND_SECONDS)
 
 
-def _compare(console: Console, name: str) -> Iterator[Finding]:
+def _compare(console: Console, config: PhysicsConfig) -> Iterator[Finding]:
     """Prints how far apart the engines are."""
     console.print("compiling MJX, a minute or more; --no-engines leaves it out")
-    apart = trials.engines_apart(name)
+    apart = trials.engines_apart(config)
     console.print(f"engines: {apart:.0e} rad apart after {trials.AGREEMENT_STEPS} control steps")
     yield from findings.engines(apart)
 

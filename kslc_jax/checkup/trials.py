@@ -1,6 +1,7 @@
 """Short simulations of a robot without a policy: it stands, it hangs, two engines are compared."""
 
 import copy
+import dataclasses
 import math
 from typing import Literal
 
@@ -82,16 +83,16 @@ def _hold(
     mujoco.mj_step(model, data)
 
 
-def engines_apart(name: str) -> float:
+def engines_apart(config: PhysicsConfig) -> float:
     """Largest difference [rad] between the joint angles of the two engines after some steps; nan
-    if an engine gives numbers that are not finite."""
-    a, b = joint_angles("mujoco", name), joint_angles("mjx", name)
+    if an engine gives numbers that are not finite. The engine of `config` does not matter."""
+    a, b = joint_angles("mujoco", config), joint_angles("mjx", config)
     return float(np.abs(a - b).max()) if np.isfinite([a, b]).all() else math.nan
 
 
-def joint_angles(engine: Literal["mujoco", "mjx"], name: str) -> np.ndarray:
+def joint_angles(engine: Literal["mujoco", "mjx"], config: PhysicsConfig) -> np.ndarray:
     """Joint angles [n, rad] after `AGREEMENT_STEPS` control steps from home."""
-    config = PhysicsConfig(robot=name, engine=engine, iterations=10, ls_iterations=10)
+    config = dataclasses.replace(config, engine=engine, iterations=10, ls_iterations=10)
     robot = physics.robot_for(config)
     home = jnp.asarray(robot.default_qpos, jnp.float32)
     start = physics.initial_state(config, home, jnp.zeros(home.size - 1))

@@ -70,15 +70,25 @@ def spec(about: Description, fidelity: Literal["train", "high"]) -> mujoco.MjSpe
     """
     make = _prepared if about.prepared else _derived
     try:
-        return make(about, _compiled(about.mjcf, about.mjcf.stat().st_mtime), fidelity == "high")
+        return make(about, _compiled(about.mjcf, changed_at(about)), fidelity == "high")
     except RobotError as error:
         known = str(error).startswith((str(about.path), str(about.mjcf)))
         raise (error if known else RobotError(f"{about.path}: {error}")) from None
 
 
+def changed_at(about: Description) -> int:
+    """When the description, its MJCF or a file that the MJCF names last changed [ns since 1970]."""
+    try:
+        files = mujoco.mju_getXMLDependencies(str(about.mjcf))
+    except mujoco.FatalError:  # no XML
+        files = [about.mjcf]
+    found = (Path(file) for file in (about.path, *files))
+    return max(file.stat().st_mtime_ns for file in found if file.exists())
+
+
 @functools.lru_cache(maxsize=2)
-def _compiled(mjcf: Path, changed: float) -> mujoco.MjModel:
-    """An MJCF as it is (cached, because meshes take seconds); `changed` is the file's time."""
+def _compiled(mjcf: Path, changed: int) -> mujoco.MjModel:
+    """An MJCF as it is (cached, because meshes take seconds); `changed` is of `changed_at`."""
     try:
         return mujoco.MjModel.from_xml_path(str(mjcf))
     except (ValueError, mujoco.FatalError) as error:

@@ -12,7 +12,6 @@ but `mjcf` are optional: the MJCF's value holds where the description has none.
 """
 
 import difflib
-import functools
 import importlib
 import importlib.util
 import math
@@ -80,9 +79,8 @@ def known() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
-@functools.lru_cache(maxsize=32)
 def read(name_or_path: str) -> Description:
-    """Reads a description (cached).
+    """Reads a description.
 
     Args:
       name_or_path: name of a shipped robot, or path of a .toml file.
