@@ -104,9 +104,7 @@ class Args:
             raise ConfigError("seconds must be positive")
         options.check_speeds(self.speeds)
         require_seed(self.seed)
-        options.check_disturbances(self.punch, self.top)
-        if self.top is not None and self.schedule is None:
-            raise ConfigError("top is the fastest command of a schedule: give --schedule too")
+        options.check_disturbances(self.punch, self.top, self.schedule is not None)
         videos = films.FILMS + films.ANIMATIONS
         for path, kinds in ((self.gait_strip, STRIPS), (self.video, videos)):
             files.require_suffix(path, kinds)

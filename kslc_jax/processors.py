@@ -1,8 +1,9 @@
-"""The processors that this process may use: affinity, quota, and the name of their model."""
+"""What this process may use of its machine: processors (affinity, quota) and memory."""
 
 import math
 import os
 import platform
+from collections.abc import Callable
 from pathlib import Path
 
 VECTORS = ("avx512f", "avx2", "avx")
@@ -19,20 +20,42 @@ def affine() -> int:
 def quota(root: Path = Path("/")) -> float:
     """Number of CPUs that the process's control groups and their parents allow.
 
-    It may be a fraction. Infinity means no limit. It reads Linux's cgroups of version 2 (`cpu.max`)
-    and 1. `root` is the root of the file system.
+    It may be a fraction. Infinity means no limit. `root` is the root of the file system.
+    """
+    return _least(root, "cpu", _group_quota)
+
+
+def memory(root: Path = Path("/")) -> float:
+    """Bytes of memory that the machine has and that the control groups allow."""
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return min(there, _least(root, "memory", _group_memory))
+
+
+def _least(root: Path, controller: str, limit: Callable[[Path], float]) -> float:
+    """The lowest limit of the process's control groups and their parents; infinity: none.
+
+    It reads Linux's cgroups of version 2 and 1.
     """
     least = math.inf
     for line in _read(root / "proc/self/cgroup").splitlines():
         _, controllers, path = line.split(":", 2)
-        if controllers and "cpu" not in controllers.split(","):
+        if controllers and controller not in controllers.split(","):
             continue
-        top = root / "sys/fs/cgroup" / ("cpu" if controllers else "")
+        top = root / "sys/fs/cgroup" / (controller if controllers else "")
         parts = [part for part in path.split("/") if part]
         # In a container the path may be that of the host. The container's own group is then `top`.
         groups = [top.joinpath(*parts[:depth]) for depth in range(len(parts) + 1)]
-        least = min([least, *map(_group_quota, groups)])
+        least = min([least, *map(limit, groups)])
     return least
+
+
+def _group_memory(group: Path) -> float:
+    """Bytes of memory that one control group allows."""
+    text = _read(group / "memory.max") or _read(group / "memory.limit_in_bytes")
+    try:
+        return float(text)
+    except ValueError:  # "max", or the files do not exist
+        return math.inf
 
 
 def _group_quota(group: Path) -> float:

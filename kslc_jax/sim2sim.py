@@ -130,7 +130,11 @@ class Args:
             raise ConfigError("heading: name at least one, finite")
         if not 0 <= self.latency <= MOST_LATENCY:
             raise ConfigError(f"latency must lie in 0 to {MOST_LATENCY} control steps")
-        options.check_disturbances(self.punch, self.top)
+        options.check_disturbances(self.punch, self.top, bool(self.schedule))
+        if self.schedule and (self.speeds is not None or self.sideways or self.turn):
+            raise ConfigError(
+                "a schedule has its own commands: leave out speeds, sideways and turn"
+            )
         for ground in self.ground:
             terrain(ground)
         for name in self.conditions:

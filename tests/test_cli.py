@@ -387,6 +387,22 @@ def test_the_quota_of_cpus(tmp_path, groups, files, quota):
     assert processors.quota(tmp_path) == quota
 
 
+@pytest.mark.parametrize(
+    ("groups", "files", "limit"),
+    [
+        ("0::/a/b", {"sys__fs__cgroup__a__memory.max": "1048576\n"}, 2**20),  # of a group above
+        ("0::/a", {"sys__fs__cgroup__a__memory.max": "max\n"}, None),
+        ("3:cpu:/\n4:memory:/job", {"sys__fs__cgroup__memory__job__memory.limit_in_bytes": "9"}, 9),
+        # A group without a limit, version 1: more than any machine has.
+        ("4:memory:/", {"sys__fs__cgroup__memory__memory.limit_in_bytes": f"{2**63 - 4096}"}, None),
+    ],
+)
+def test_the_limit_of_memory(tmp_path, groups, files, limit):
+    cgroup(tmp_path, groups, **files)
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    assert processors.memory(tmp_path) == (there if limit is None else limit)
+
+
 def test_the_processor_and_its_vector_instructions(tmp_path):
     path = tmp_path / "cpuinfo"
     path.write_text("processor\t: 0\nmodel name\t: A CPU\nflags\t\t: fpu avx avx2 sse\n\nother\n")

@@ -238,6 +238,9 @@ def test_a_side_step_and_a_turn_are_commanded_with_every_speed(random_policy, mo
         (["x", "--latency", "99"], "latency must lie in 0 to 50"),
         (["x", "--punch", "-1"], "punch must be a force"),
         (["x", "--top", "0"], "top must be a positive speed"),
+        (["x", "--top", "2"], "top is the fastest command of a schedule"),
+        (["x", "--schedule", "stop", "--speeds", "1"], "a schedule has its own commands"),
+        (["x", "--schedule", "stop", "--turn", "1"], "a schedule has its own commands"),
         (["x", "--perturb", "wind=3"], "cannot read 'wind=3'"),
     ],
 )

@@ -81,9 +81,14 @@ def check_trials(speeds: Sequence[float] | None, seeds: int, seconds: float) -> 
         raise ConfigError(f"seconds must be a whole number from {SHORTEST:g} to {LONGEST:g}")
 
 
-def check_disturbances(punch: float, top: float | None) -> None:
-    """ConfigError if the force of punches [N] or the top speed of schedules [m/s] is wrong."""
+def check_disturbances(punch: float, top: float | None, scheduled: bool) -> None:
+    """ConfigError if the force of punches [N] or the top speed of schedules [m/s] is wrong.
+
+    `scheduled` is True if there is a schedule. Without one there is no top speed.
+    """
     if not (math.isfinite(punch) and punch >= 0):
         raise ConfigError("punch must be a force in newtons, not negative")
     if top is not None and not (math.isfinite(top) and top > 0):
         raise ConfigError("top must be a positive speed")
+    if top is not None and not scheduled:
+        raise ConfigError("top is the fastest command of a schedule: give --schedule too")

@@ -9,12 +9,11 @@ docs/performance.md compares the estimate with measurements.
 
 import dataclasses
 import functools
-import os
 from typing import Any
 
 import jax
 
-from kslc_jax import physics, rollout, train_step
+from kslc_jax import physics, processors, rollout, train_step
 from kslc_jax.config import Config, ConfigError, RunConfig
 from kslc_jax.ppo import Samples
 from kslc_jax.rollout import Trajectory
@@ -117,7 +116,7 @@ def check(config: Config, devices: int = 1, seeds: int = 1) -> None:
     before = _bytes(state.env) / devices + _bytes(state.learner)  # the loop keeps a copy
     need = seeds * (estimate(config, devices) + before)
     if memory is None:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") - PROCESS
+        memory = processors.memory() - PROCESS
     if need > memory:
         many = "--seeds, " * (seeds > 1)
         raise ConfigError(
