@@ -83,6 +83,13 @@ def seeds_in(run_dir: Path) -> list[int]:
     return sorted(int(name) for name in names if name.isdecimal())
 
 
+def seeds_hint(run_dir: Path) -> str:
+    """End of a message: the run folders of the seeds in `run_dir`; empty if it has none."""
+    seeds = seeds_in(run_dir)
+    names = ", ".join(str(seed_folder(run_dir, seed)) for seed in seeds)
+    return f"; it holds several trainings, name one: {names}" if seeds else ""
+
+
 # ------------------------------------------------------------------------------------- writing
 
 FIGURES = (".png", ".jpg", ".webp", ".svg", ".pdf")

@@ -166,5 +166,5 @@ def checkpoint_folder(path: Path) -> Path:
     root = path / files.CHECKPOINTS if (path / files.CHECKPOINTS).is_dir() else path
     steps = whole_checkpoints(root)
     if not steps:
-        raise CheckpointError(f"no checkpoint in {root}")
+        raise CheckpointError(f"no checkpoint in {root}{files.seeds_hint(path)}")
     return max(steps, key=lambda p: int(p.name)).resolve()

@@ -53,8 +53,10 @@ def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
     )
 
 
-def require_trunk(config: RandomizeConfig, robot: Robot) -> None:
-    """ConfigError if the trunk could become too light."""
+def require(config: RandomizeConfig, robot: Robot) -> None:
+    """ConfigError if the trunk could become too light, or if the robot has no arms to be held."""
+    if config.held_arms and not robot.is_arm.any():
+        raise ConfigError(f"held arms: {robot.name} has no arms; leave them out")
     trunk = float(robot.mj_model.body_mass[robot.trunk_body_id])
     left = trunk * config.link_mass[0] + config.base_mass[0]
     if left < LIGHTEST * trunk:
@@ -68,9 +70,9 @@ def sample(config: RandomizeConfig, robot: Robot, key: jax.Array) -> Dynamics:
     """Draws the parameters of one episode. Each is uniform in the range of its name in `config`.
 
     Raises:
-      ConfigError: see `require_trunk`.
+      ConfigError: see `require`.
     """
-    require_trunk(config, robot)
+    require(config, robot)
     described = nominal(robot)
     names = [f.name for f in dataclasses.fields(Dynamics) if hasattr(config, f.name)]
     shapes = [getattr(described, name).shape for name in names]

@@ -602,6 +602,8 @@ def test_a_robot_is_tried_under_what_it_can_have():
     held = dataclasses.replace(plain.randomize, held_arms=1.0)
     with pytest.raises(config.ConfigError, match="has no arms"):
         trials.require(dataclasses.replace(plain, randomize=held), high)
+    with pytest.raises(config.ConfigError, match="has no arms"):  # so in training, in the viewer
+        randomize.sample(held, high, jax.random.key(0))
 
 
 def test_the_soles_of_a_turned_foot_wander_inside_it():

@@ -38,6 +38,7 @@ from kslc_jax.training import (
     starting,
 )
 from kslc_jax.training.logs import MetricsFile, Progress
+from kslc_jax.viewer import following
 
 DEBUG = ["--preset", "debug"]
 
@@ -387,6 +388,15 @@ class TestErrors:
     def test_policy_not_there(self):
         with pytest.raises(CheckpointError, match="no run, checkpoint or shipped"):
             kslc_jax.load_policy("no-such-policy")
+
+    def test_policy_of_several_seeds(self, tmp_path):
+        for seed in (0, 1):
+            (tmp_path / f"seed-{seed}").mkdir()
+            (tmp_path / f"seed-{seed}" / "config.json").write_text("{}")
+        with pytest.raises(CheckpointError, match=r"several trainings, name one: .*/seed-0, .*1$"):
+            kslc_jax.load_policy(tmp_path)
+        with pytest.raises(ConfigError, match=r"several trainings, name one: .*/seed-0, .*1$"):
+            following.Follower(tmp_path)
 
     def test_damaged_policy(self, whole, tmp_path):
         shutil.copytree(whole[0], tmp_path / "r")

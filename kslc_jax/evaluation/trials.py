@@ -130,8 +130,8 @@ def engine(
 
 def require(setting: Setting, robot: Robot) -> None:
     """ConfigError if the robot cannot have the setting's conditions."""
-    randomize.require_trunk(setting.randomize, robot)
-    variation.require(setting.randomize, setting.variation, robot)
+    randomize.require(setting.randomize, robot)
+    variation.require(setting.variation, robot)
 
 
 def trial_config(config: Config, setting: Setting, count: int) -> Config:

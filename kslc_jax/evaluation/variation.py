@@ -54,22 +54,21 @@ def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
 def _possible(changes: dict[str, Any], robot: Robot) -> bool:
     """True if the robot can have the `perturbations.changes` of a condition."""
     made = perturbations.settings(changes, RandomizeConfig())
-    return not _lacking(made["randomize"], made.get("variation", Variation()), robot)
+    held = made["randomize"].held_arms > 0.0 and not robot.is_arm.any()
+    return not held and not _lacking(made.get("variation", Variation()), robot)
 
 
-def require(randomize: RandomizeConfig, variation: Variation, robot: Robot) -> None:
+def require(variation: Variation, robot: Robot) -> None:
     """ConfigError if the robot lacks a part that the changes need.
 
-    `hands` and held arms need arms; `sole` needs feet of one box each, with its z axis upwards.
+    `hands` needs arms; `sole` needs feet of one box each, with its z axis upwards.
     """
-    if lacking := _lacking(randomize, variation, robot):
+    if lacking := _lacking(variation, robot):
         raise ConfigError(f"{lacking}; leave it out")
 
 
-def _lacking(randomize: RandomizeConfig, variation: Variation, robot: Robot) -> str:
+def _lacking(variation: Variation, robot: Robot) -> str:
     """The reason why the robot cannot have the changes; empty if it can."""
-    if randomize.held_arms and not robot.is_arm.any():
-        return f"held arms: {robot.name} has no arms"
     if variation.sole and len(_foot_boxes(robot)) < 2:
         return f"sole: a foot of {robot.name} is not one box with its z axis upwards"
     if variation.hands and not len(robot.hand_body_ids):

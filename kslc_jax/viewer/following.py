@@ -30,6 +30,7 @@ class Follower:
         if not (run_dir / files.CONFIG).is_file():
             raise ConfigError(
                 f"--follow: {run_dir} is no run folder of a training (no {files.CONFIG})"
+                f"{files.seeds_hint(run_dir)}"
             )
         self._run_dir = run_dir
         self._seen: Path | None = None
