@@ -231,21 +231,18 @@ def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 # -------------------------------------------------------------------------------------- mujoco
 
-_batches: dict[Any, mujoco.batch.Batch] = {}
 _batches_lock = threading.Lock()
 
 
+@functools.lru_cache(maxsize=8)
 def _batch(robot: Robot, size: int, threads: int, written: frozenset[str]) -> mujoco.batch.Batch:
     """Simulator batch of this size (cached). Every call of `_host_step` overwrites its state and
     the model fields `written`; all other fields are the robot's.
 
     MuJoCo's own default, 0 threads, would start one for every CPU of the machine.
     """
-    key = (robot, size, threads, written)
-    if key not in _batches:
-        count = threads or processors.usable()
-        _batches[key] = mujoco.batch.Batch(robot.mj_model, size, nthread=count)
-    return _batches[key]
+    count = threads or processors.usable()
+    return mujoco.batch.Batch(robot.mj_model, size, nthread=count)
 
 
 def _step_mujoco(

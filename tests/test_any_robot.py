@@ -353,6 +353,8 @@ def test_a_training_keeps_its_robot(mine, tmp_path):
     kept = run_folder.read_config(run)
     assert kept.physics.robot == str(run / "robot" / "biped.toml")
     assert str(tmp_path) not in (run / "config.json").read_text()
+    (tmp_path / "link").symlink_to(run)
+    assert run_folder.read_config(tmp_path / "link") == kept
     same_training.difference(kept, setup)
     run_folder.open_folder(run, kept, True, {})
     (run / "robot").rename(run / "robots")

@@ -49,7 +49,7 @@ def find_robot(robot: str, folder: Path) -> str:
     if not is_description(robot):
         return robot
     name = Path(robot).name
-    copy = folder.absolute() / ROBOT_FOLDER / name
+    copy = folder.resolve() / ROBOT_FOLDER / name  # the same path also through a link
     if copy.is_file():
         return str(copy)
     require(
