@@ -3,6 +3,10 @@
 It runs in turn: physics alone (random actions), the rollout, and the whole train step of a preset.
 
   python -m benchmarks.throughput [--preset laptop] [--repeats 5] [--engines mujoco mjx]
+
+With --robot it runs in turn the whole train step of that robot and of XBot-L.
+
+  python -m benchmarks.throughput --robot unitree_g1 --engines mujoco
 """
 
 from collections.abc import Callable
@@ -14,9 +18,9 @@ import jax
 import tyro
 
 from benchmarks import timing
-from kslc_jax import motors, physics, train_step
+from kslc_jax import motors, physics, similar, train_step
 from kslc_jax import rollout as rollout_lib
-from kslc_jax.config import Config, preset
+from kslc_jax.config import XBOT_L, Config, preset
 
 
 def physics_only(config: Config) -> Callable[[], Any]:
@@ -87,12 +91,36 @@ class Args:
     """Timed calls of each part."""
     engines: tuple[str, ...] = ("mujoco", "mjx")
     """Physics engines to compare."""
+    robot: str | None = None
+    """Robot to compare with XBot-L: a shipped one, or the path of a description."""
     json: Path | None = None
     """File for the numbers."""
 
 
+def robots(args: Args) -> None:
+    """Prints the control steps/s of whole training of XBot-L and of another robot."""
+    rates: dict[str, dict[str, float]] = {}
+    for engine in args.engines:
+        runs, sizes = {}, {}
+        for robot in (XBOT_L, args.robot or XBOT_L):
+            config = timing.resized(similar.preset(args.preset, robot), args.num_envs)
+            name = physics.robot_for(config.physics).name
+            runs[name] = training(timing.on_engine(config, engine))
+            sizes[name] = config.batch_size
+        seconds = timing.medians(timing.in_turn(runs, args.repeats))
+        rates[engine] = {name: sizes[name] / s for name, s in seconds.items()}
+        xbot = next(iter(rates[engine].values()))
+        for name, rate in rates[engine].items():
+            ratio = rate / xbot
+            print(f"{engine:8} {name:16} {rate:9.0f} steps/s   {ratio:5.2f} of XBot-L", flush=True)
+    timing.report({"preset": args.preset, "steps_per_second": rates}, args.json)
+
+
 def main(args: Args) -> None:
     """Prints a table."""
+    if args.robot is not None:
+        robots(args)
+        return
     base = timing.resized(preset(args.preset), args.num_envs)
     results = {}
     for engine in args.engines:

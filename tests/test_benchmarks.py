@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from states import ACTOR, XBOT, make_command, make_gait
+from states import ACTOR, BIPED, XBOT, make_command, make_gait
 
 from benchmarks import (
     compile_time,
@@ -195,6 +195,16 @@ def test_gym_environment_is_the_same_robot(debug):
 
 
 @pytest.mark.slow(reason="compiles three programs")
+@pytest.mark.slow(reason="compiles two train steps")
+def test_throughput_of_another_robot(tmp_path, capsys):
+    path = tmp_path / "out.json"
+    asked = {"num_envs": 16, "repeats": 1, "engines": ("mujoco",), "robot": BIPED}
+    throughput.main(throughput.Args(preset="debug", json=path, **asked))
+    rates = json.loads(path.read_text())["steps_per_second"]["mujoco"]
+    ratio = rates["biped"] / rates["XBot-L"]
+    assert f"{ratio:.2f} of XBot-L" in capsys.readouterr().out
+
+
 def test_throughput(tmp_path):
     """Physics alone is faster than the rollout; the rollout is faster than training."""
     path = tmp_path / "numbers.json"
