@@ -23,88 +23,19 @@ Examples:
 import contextlib
 import dataclasses
 import json
-import math
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import tyro
 
 from kslc_jax import cli, files
-from kslc_jax.config import ConfigError, RandomizeConfig, require_seed
-from kslc_jax.evaluation import bars as bars_lib
+from kslc_jax.config import ConfigError, require_seed
 from kslc_jax.evaluation import options, tables
-from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP, Bar, bars
-from kslc_jax.evaluation.perturbations import ALL, changes, left_out, settings
-
-if TYPE_CHECKING:
-    from kslc_jax.robot import Robot
-
-SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
-"""Commanded speeds [m/s]. No bar uses the last one; only --json has its numbers."""
-
-HEADINGS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
-"""Starting headings [rad] of the schedule. At pi the measured yaw jumps between pi and -pi."""
-
-SCHEDULE = "random"
-
-DRAKE_SECONDS = 20.0
-
-
-@dataclass(frozen=True)
-class Size:
-    """Size of the measurement: speeds [m/s], headings [rad], robots per condition, seconds."""
-
-    speeds: tuple[float, ...]
-    seeds: int
-    seconds: float
-    headings: tuple[float, ...]
-    schedule_robots: int
-    schedule_seconds: float
-    perturbations: tuple[str, ...]
-    perturbed_speeds: tuple[float, ...]
-    perturbed_seeds: int
-    perturbed_seconds: float
-    harsh_seeds: int
-    harsh_seconds: float
-    top: float = TOP  # fastest speed that Drake tries
-
-    def for_robot(self, robot: "Robot") -> "Size":
-        """The size for another robot: other speeds, other perturbations."""
-        from kslc_jax import similar
-        from kslc_jax.evaluation import variation
-
-        factors = similar.factors(robot)
-
-        def own(speeds: tuple[float, ...]) -> tuple[float, ...]:
-            return tuple(bars_lib.scaled(speed, factors[similar.SPEED]) for speed in speeds)
-
-        return dataclasses.replace(
-            self,
-            speeds=own(self.speeds),
-            perturbations=variation.for_robot(self.perturbations, robot),
-            perturbed_speeds=own(self.perturbed_speeds),
-            top=own((self.top,))[0],
-        )
-
-
-FULL = Size(SPEEDS, 4, 60.0, HEADINGS, 16, 60.0, ALL, (1.0, 2.0, PERTURBED_TOP), 4, 20.0, 32, 30.0)
-QUICK = Size(
-    (0.0, 0.5, 2.0, 3.5, 4.0),
-    2,
-    15.0,
-    (0.0, math.pi),
-    8,
-    20.0,
-    ("push=0.5",),
-    (PERTURBED_TOP,),
-    2,
-    8.0,
-    4,
-    8.0,
-)
+from kslc_jax.evaluation.bars import Bar, bars, ranked
+from kslc_jax.evaluation.perturbations import left_out
+from kslc_jax.evaluation.size import FULL, QUICK, Size
 
 
 @dataclass(frozen=True)
@@ -153,156 +84,6 @@ class Args:
 
 
 Results = dict[str, Any]
-Progress = Callable[[str, float], None]
-
-
-def measure(
-    size: Size,
-    args: Args,
-    policy,
-    progress: Progress,
-    keep: Callable[[Results], None] = lambda found: None,
-) -> Results:
-    """Measures everything that `bars` reads. Calls `keep` with the results after each part."""
-    found: Results = {}
-    for name, part in PARTS.items():
-        if name not in ("harsh", "drake") or getattr(args, name):
-            found[name] = part(size, args, policy, progress)
-            keep(found)
-    return found
-
-
-def _speeds(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
-    from kslc_jax.evaluation import trials
-    from kslc_jax.evaluation.measure import measure as measured
-
-    plain = trials.Setting(trials.engine(policy, "high"), seconds=size.seconds)
-
-    def told(share: float) -> None:
-        progress("speeds", share)
-
-    rows = measured(policy, plain, size.speeds, size.seeds, args.seed, told)
-    return _marked(rows, policy, plain)
-
-
-def robots_that_differ(name: str) -> RandomizeConfig:
-    """The randomisation of the laptop preset for the robot of this name, without pushes, punches.
-
-    All policies of a robot are tried with it, also those of another recipe.
-    """
-    from kslc_jax import similar
-
-    drawn = similar.preset("laptop", name).randomize
-    return dataclasses.replace(drawn, push_seconds=0.0, punch=(0.0, 0.0), held_arms=0.0)
-
-
-def _schedules(
-    size: Size, args: Args, policy, progress: Progress
-) -> dict[str, list[dict[str, Any]]]:
-    from kslc_jax.evaluation import scheduled, schedules, trials
-
-    found, robots = {}, robots_that_differ(policy.config.physics.robot)
-    schedule = schedules.named(SCHEDULE, policy.config, float(policy.curriculum.v_max))
-    for i, heading in enumerate(size.headings):
-
-        def told(share: float, i: int = i) -> None:
-            progress("schedules", (i + share) / len(size.headings))
-
-        setting = trials.Setting(
-            trials.engine(policy, "high"),
-            randomize=robots,
-            seconds=size.schedule_seconds,
-            heading=heading,
-        )
-        found[f"heading={heading:.2f}"] = scheduled.measure(
-            policy, setting, [schedule], size.schedule_robots, args.seed, told
-        )
-    return found
-
-
-def _perturbed(
-    size: Size, args: Args, policy, progress: Progress
-) -> dict[str, list[dict[str, float]]]:
-    found = {}
-    for i, condition in enumerate(size.perturbations):
-
-        def told(share: float, i: int = i) -> None:
-            progress("perturbed", (i + share) / len(size.perturbations))
-
-        trial = condition, size.perturbed_speeds, size.perturbed_seeds, size.perturbed_seconds
-        found[condition] = _tried(args, policy, *trial, told)
-    return found
-
-
-def _harsh(size: Size, args: Args, policy, progress: Progress) -> dict[str, dict[str, Any]]:
-    """The wanted share and the rows of each condition of `bars.HARSH` that the robot can have."""
-    from kslc_jax import physics, similar
-    from kslc_jax.evaluation import variation
-
-    robot = physics.robot_for(policy.config.physics)
-    factor, found = similar.factors(robot)[similar.SPEED], {}
-    for i, (condition, (wanted, speeds)) in enumerate(bars_lib.HARSH.items()):
-
-        def told(share: float, i: int = i) -> None:
-            progress("harsh", (i + share) / len(bars_lib.HARSH))
-
-        own = tuple(bars_lib.scaled(speed, factor) for speed in speeds)
-        for name in variation.for_robot([condition], robot):
-            trial = name, own, size.harsh_seeds, size.harsh_seconds
-            found[name] = {"wanted": wanted, "rows": _tried(args, policy, *trial, told)}
-    return found
-
-
-def _tried(
-    args: Args,
-    policy,
-    condition: str,
-    speeds: tuple[float, ...],
-    seeds: int,
-    seconds: float,
-    told: Callable[[float], None],
-) -> list[dict[str, float]]:
-    """Survival and mean speed at each commanded speed [m/s] under one condition."""
-    from kslc_jax.evaluation import gait_metrics, trials
-    from kslc_jax.evaluation.measure import measure as measured
-
-    def speed(trace, command: float, robot, dt: float) -> dict[str, float]:
-        return gait_metrics.speed(trace, command, dt)
-
-    made = changes(condition)
-    engine = trials.engine(policy, "high", made.pop("terrain", None))
-    plain = trials.Setting(engine, seconds=seconds)
-    setting = dataclasses.replace(plain, **settings(made, plain.randomize))
-    rows = measured(policy, setting, speeds, seeds, args.seed, told, speed)
-    return _marked(rows, policy, setting)
-
-
-def _marked(rows: list[dict[str, Any]], policy, setting) -> list[dict[str, Any]]:
-    """The rows, each with the reasons of `trained.beyond`."""
-    from kslc_jax.evaluation import trained
-
-    return [row | trained.beyond(policy, setting, (row["command"], 0.0, 0.0)) for row in rows]
-
-
-def _drake(size: Size, args: Args, policy, progress: Progress) -> list[dict[str, float]]:
-    from kslc_jax.evaluation import trials
-    from kslc_jax.evaluation.measure import measure as measured
-
-    setting = trials.Setting(
-        trials.engine(policy, "high"), seconds=DRAKE_SECONDS, simulate=options.simulator("drake")
-    )
-    speeds = [speed for speed in size.speeds if speed <= size.top]
-    return measured(policy, setting, speeds, 1, args.seed, lambda share: progress("drake", share))
-
-
-PARTS = {
-    "speeds": _speeds,
-    "schedules": _schedules,
-    "perturbed": _perturbed,
-    "harsh": _harsh,
-    "drake": _drake,
-}
-"""Parts of the measurement, in their order."""
 
 
 def table(found: list[Bar], title: str):
@@ -354,7 +135,7 @@ def side_by_side(kept: dict[str, Results]):
     from rich.table import Table
 
     judged: dict[str, list[Bar]] = {name: one["bars"] for name, one in kept.items()}
-    names = bars_lib.ranked(judged)
+    names = ranked(judged)
     median = names[len(names) // 2]
     missed = sum(not bar.met for bar in judged[median])
     caption = f"median: {median}, which misses {missed} of {len(judged[median])} bars. *: missed"
@@ -383,7 +164,7 @@ def _report(args: Args, path: Path) -> None:
     from rich.progress import Progress
 
     from kslc_jax import physics, similar
-    from kslc_jax.evaluation import trials
+    from kslc_jax.evaluation import judging, trials
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
@@ -392,7 +173,9 @@ def _report(args: Args, path: Path) -> None:
     policy = load_policy(path)
     robot = physics.robot_for(trials.engine(policy, "high"))
     options.require_engine(engine, robot)
-    size, factors = args.size.for_robot(robot), similar.factors(robot)
+    size, factors = judging.for_robot(args.size, robot), similar.factors(robot)
+    left = {name for name in ("harsh", "drake") if not getattr(args, name)}
+    names = [name for name in judging.PARTS if name not in left]
     about: Results = {"policy": policy_name(path), "step": policy.step, "quick": args.quick}
     about |= {"robot": robot.name, "seed": args.seed, "size": dataclasses.asdict(size)}
 
@@ -408,15 +191,13 @@ def _report(args: Args, path: Path) -> None:
     if missing := left_out(args.size.perturbations, size.perturbations):
         screen.print(missing)
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
-        tasks = {name: bar.add_task(name, total=1.0, start=False) for name in PARTS}
-        for name in ("harsh", "drake"):
-            bar.update(tasks[name], visible=getattr(args, name))
+        tasks = {name: bar.add_task(name, total=1.0, start=False) for name in names}
 
         def progress(name: str, share: float) -> None:
             bar.start_task(tasks[name])
             bar.update(tasks[name], completed=share)
 
-        found = measure(size, args, policy, progress, keep_part)
+        found = judging.measure(policy, size, args.seed, names, progress, keep_part)
     against = bars(found, factors[similar.SPEED], arms=bool(robot.is_arm.any()))
     screen.print(table(against, f"{path}, train step {policy.step}"))
     keep(found | {"bars": [dataclasses.asdict(one) for one in against]})

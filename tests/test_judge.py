@@ -8,9 +8,11 @@ import pytest
 
 from kslc_jax import judge, robot
 from kslc_jax import policy as policy_lib
+from kslc_jax.evaluation import judging, scheduled, tables, variation
 from kslc_jax.evaluation import measure as measuring
-from kslc_jax.evaluation import scheduled, tables, variation
 from kslc_jax.evaluation.bars import HARSH, bars
+from kslc_jax.evaluation.perturbations import ALL
+from kslc_jax.evaluation.size import FULL
 
 
 def row(command, **changes):
@@ -122,8 +124,7 @@ def test_harsh_conditions_are_tried_as_named(monkeypatch):
 
     monkeypatch.setattr(measuring, "measure", measure)
     policy = policy_lib.load_policy("xbot_l_run")
-    args = judge.Args((Path("p"),), harsh=True)
-    found = judge._harsh(judge.FULL, args, policy, lambda name, share: None)
+    found = judging.harsh(policy, FULL, 0, lambda share: None)
     assert [name for name in found] == list(HARSH) and found["punch=300"]["wanted"] == 0.95
     punched, harder, held, rough, waves, slope = (setting for setting, _, _ in seen)
     assert punched.randomize.punch == (300, 300) and punched.seconds == 30
@@ -171,13 +172,13 @@ def test_a_smaller_robot_has_slower_bars_and_one_without_arms_has_none_on_them()
 def test_a_robot_of_another_size_is_tried_at_its_own_speeds():
     """Lengths scale with l, speeds with sqrt(l), masses with m, torques with m l."""
     xbot = robot.load("high")
-    assert judge.FULL.for_robot(xbot) == judge.FULL
+    assert judging.for_robot(FULL, xbot) == FULL
     quarter = dataclasses.replace(xbot, length_ratio=0.25, mass_ratio=0.5)
-    small = judge.FULL.for_robot(quarter)
+    small = judging.for_robot(FULL, quarter)
     assert small.top == 2.0
     assert small.speeds == (0.0, 0.25, 0.5, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25)
-    assert small.perturbed_speeds == (0.5, 1.0, 1.5) and small.headings == judge.HEADINGS
-    theirs = dict(zip(judge.ALL, small.perturbations, strict=True))
+    assert small.perturbed_speeds == (0.5, 1.0, 1.5) and small.headings == FULL.headings
+    theirs = dict(zip(ALL, small.perturbations, strict=True))
     changed = {
         "payload=-5": "payload=-2.5",
         "payload=5": "payload=2.5",
@@ -188,7 +189,7 @@ def test_a_robot_of_another_size_is_tried_at_its_own_speeds():
         "sole=0.02": "sole=0.005",
         "joints=1": "joints=0.12",
     }
-    assert theirs == dict(zip(judge.ALL, judge.ALL, strict=True)) | changed
+    assert theirs == dict(zip(ALL, ALL, strict=True)) | changed
 
 
 def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, capsys):
@@ -199,7 +200,7 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
         return [row(speed) for speed in speeds]
 
     def under(policy, setting, plans, robots, seed, progress):
-        assert setting.randomize == judge.robots_that_differ("xbot_l")
+        assert setting.randomize == judging.robots_that_differ("xbot_l")
         progress(1.0)
         return [{"schedule": plan.name, "survival": 0.5} for plan in plans]
 
@@ -213,12 +214,12 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
     assert "speed at command 0 [m/s]" in shown  # rich takes it for a style unless told
     assert shown.count("yes") == 12 and shown.count("NO") == 1
     kept = json.loads(out.read_text())
-    assert len(kept["bars"]) == 13 and kept["size"]["seeds"] == judge.FULL.seeds
+    assert len(kept["bars"]) == 13 and kept["size"]["seeds"] == FULL.seeds
     assert len(kept["perturbed"]) == 16 and len(kept["schedules"]) == 4
 
 
 def test_the_robots_of_the_schedules_differ_in_more_than_their_base():
-    drawn = judge.robots_that_differ("xbot_l")
+    drawn = judging.robots_that_differ("xbot_l")
     assert drawn.link_mass == (0.9, 1.1) and drawn.hand_mass == (0.0, 0.5)
     assert drawn.friction[0] < drawn.friction[1] and drawn.motor_strength == (0.9, 1.0)
     assert not drawn.push_seconds and drawn.punch == (0.0, 0.0) and not drawn.held_arms
@@ -277,16 +278,8 @@ def test_what_lies_beyond_the_training_is_marked(monkeypatch):
 
     monkeypatch.setattr(measuring, "measure", measure)
     policy = policy_lib.load_policy("xbot_l_run")
-    args = judge.Args((Path("p"),), harsh=True)
-
-    def told(name, share):
-        pass
-
-    parts = {
-        "speeds": judge._speeds(judge.FULL, args, policy, told),
-        "perturbed": judge._perturbed(judge.FULL, args, policy, told),
-        "harsh": judge._harsh(judge.FULL, args, policy, told),
-    }
+    names = "speeds", "perturbed", "harsh"
+    parts = judging.measure(policy, FULL, 0, names, lambda name, share: None)
     assert parts["harsh"]["punch=500"]["rows"][0]["beyond"] == ["punch"]
     assert "beyond" not in parts["speeds"][1] and "beyond" not in parts["perturbed"]["payload=5"][0]
     found = {bar.name: bar for bar in bars(good() | parts)}

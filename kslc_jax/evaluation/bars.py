@@ -52,7 +52,7 @@ def bars(results: dict[str, Any], scale: float = 1.0, arms: bool = True) -> list
     """Compares the results with all bars.
 
     Args:
-      results: of `judge.measure`. "speeds": rows by commanded speed; "schedules" and "perturbed":
+      results: of `judging.measure`. "speeds": rows by commanded speed; "schedules" and "perturbed":
         rows by condition; "harsh", only with --harsh: the wanted share and the rows by condition;
         "drake": rows by commanded speed, only with --drake.
       scale: factor on the commanded speeds, see `scaled`.
