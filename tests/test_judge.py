@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from kslc_jax import judge, robot
+from kslc_jax import config, judge, robot
 from kslc_jax import policy as policy_lib
 from kslc_jax.evaluation import judging, scheduled, tables, variation
 from kslc_jax.evaluation import measure as measuring
 from kslc_jax.evaluation.bars import HARSH, bars
 from kslc_jax.evaluation.perturbations import ALL
-from kslc_jax.evaluation.size import FULL
+from kslc_jax.evaluation.size import FULL, ROBOTS
 
 
 def row(command, **changes):
@@ -219,7 +219,14 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
 
 
 def test_the_robots_of_the_schedules_differ_in_more_than_their_base():
-    drawn = judging.robots_that_differ("xbot_l")
+    """Training draws from ranges that are at least as wide."""
+    drawn, trained = judging.robots_that_differ("xbot_l"), config.preset("laptop").randomize
+    assert drawn == ROBOTS
+    for field in dataclasses.fields(drawn):
+        if field.name.startswith(("push", "punch", "held", "ground")):
+            continue
+        mine, theirs = getattr(drawn, field.name), getattr(trained, field.name)
+        assert theirs[0] <= mine[0] <= mine[1] <= theirs[1], field.name
     assert drawn.link_mass == (0.9, 1.1) and drawn.hand_mass == (0.0, 0.5)
     assert drawn.friction[0] < drawn.friction[1] and drawn.motor_strength == (0.9, 1.0)
     assert not drawn.push_seconds and drawn.punch == (0.0, 0.0) and not drawn.held_arms

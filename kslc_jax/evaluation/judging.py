@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from kslc_jax import physics, similar
-from kslc_jax.config import RandomizeConfig
+from kslc_jax import robot as robot_lib
+from kslc_jax.config import RandomizeConfig, preset
 from kslc_jax.evaluation import (
     bars,
     gait_metrics,
@@ -19,7 +20,7 @@ from kslc_jax.evaluation import (
     variation,
 )
 from kslc_jax.evaluation import measure as measuring
-from kslc_jax.evaluation.size import Size
+from kslc_jax.evaluation.size import ROBOTS, Size
 from kslc_jax.policy import Policy
 from kslc_jax.robot import Robot
 
@@ -76,12 +77,9 @@ def for_robot(size: Size, robot: Robot) -> Size:
 
 
 def robots_that_differ(name: str) -> RandomizeConfig:
-    """The randomisation of the laptop preset for the robot of this name, without pushes, punches.
-
-    All policies of a robot are tried with it, also those of another recipe.
-    """
-    drawn = similar.preset("laptop", name).randomize
-    return dataclasses.replace(drawn, push_seconds=0.0, punch=(0.0, 0.0), held_arms=0.0)
+    """`ROBOTS`, scaled to a robot: a shipped one, or the path of a description."""
+    config = dataclasses.replace(preset("laptop"), randomize=ROBOTS)
+    return similar.scaled(config, robot_lib.load(name=name)).randomize
 
 
 def speeds(policy: Policy, size: Size, seed: int, told: Told) -> Rows:

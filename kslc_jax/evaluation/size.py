@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from kslc_jax.config import RandomizeConfig
 from kslc_jax.evaluation.bars import PERTURBED_TOP, TOP
 from kslc_jax.evaluation.perturbations import ALL
 
@@ -11,6 +12,26 @@ SPEEDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5, 4.0, 4.5)
 
 HEADINGS = (0.0, math.pi / 2, math.pi, -math.pi / 2)
 """Starting headings [rad] of the schedule. At pi the measured yaw jumps between pi and -pi."""
+
+
+ROBOTS = RandomizeConfig(
+    friction=(0.1, 2.0),
+    ground_friction=0.6,
+    base_mass=(-5.0, 5.0),
+    base_com=(-0.02, 0.02),
+    kp=(0.9, 1.1),
+    kd=(0.9, 1.1),
+    motor_strength=(0.9, 1.0),
+    joint_friction=(0.0, 1.0),
+    link_mass=(0.9, 1.1),
+    link_com=(-0.01, 0.01),
+    hand_mass=(0.0, 0.5),
+    sole=(0.0, 0.02),
+    noise=(0.0, 1.0),
+    push_seconds=0.0,
+)
+"""Robots that differ, for XBot-L: those of the schedule. They do not change with a recipe, so that
+policies of all recipes meet the same robots."""
 
 
 @dataclass(frozen=True)
