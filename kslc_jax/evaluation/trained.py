@@ -58,7 +58,7 @@ def _pace(schedule: Schedule) -> float:
 
 
 def _command_reasons(trained: Config, v_max: float, asked) -> list[str]:
-    """ "speed", "sideways" and "turn", as far as one of the commands asks for more."""
+    """Those of "speed", "sideways" and "turn" for which a command asks more than the training."""
     found = set()
     for vx, vy, yaw_rate in asked:
         right, left, turn = commands.widest(trained.command, vx)
