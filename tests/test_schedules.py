@@ -233,6 +233,10 @@ def test_what_lies_beyond_the_training_is_named(still):
         setting = dataclasses.replace(plain, **changes)
         return trained.beyond(policy, setting, command).get("beyond", [])
 
+    def turns(vx, heading):
+        steps = schedules.Step(9.0, vx, heading=0.0), schedules.Step(9.0, vx, heading=heading)
+        return schedules.Schedule("turns", top=vx, steps=steps)
+
     def robots(**changes):
         return reasons(randomize=dataclasses.replace(trials.NOMINAL, **changes))
 
@@ -249,6 +253,13 @@ def test_what_lies_beyond_the_training_is_named(still):
     assert robots(punch=(300.0, 300.0), held_arms=1.0) == ["punch", "arms"]
     assert robots(punch=(100.0, 100.0)) == []
     assert reasons(latency=1, imu_offset=(0.1, 0.0)) == ["latency", "imu"]
+    assert reasons(schedule=turns(0.5, 3.0)) == [] and reasons(schedule=turns(0.5, 0.2)) == []
+    # At v_max the yaw rate is at most 0.5 (1 - 0.5 / 4) pi = 1.37; it is cut at 1. With a cut at 2:
+    wide = dataclasses.replace(CONFIG.command, max_yaw_rate=2.0)
+    policy = Policy(dataclasses.replace(CONFIG, command=wide), None, policy.curriculum, 0)
+    assert reasons(schedule=turns(0.5, 3.0)) == ["turn"] and reasons(schedule=turns(0.0, 3.0)) == []
+    assert reasons(schedule=turns(0.5, 3.0), heading=3.0) == ["turn"]  # from the second round on
+    policy = Policy(CONFIG, None, policy.curriculum, 0)
     stop = schedules.named("stop", CONFIG, v_max)
     jitter = schedules.named("jitter", CONFIG, v_max)
     assert reasons(schedule=stop) == [] and reasons(schedule=jitter) == ["pace"]

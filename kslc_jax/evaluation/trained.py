@@ -1,6 +1,7 @@
 """Compares the conditions of a trial with the conditions that the policy was trained for."""
 
 import dataclasses
+import math
 from collections.abc import Sequence
 
 from kslc_jax import commands
@@ -29,7 +30,7 @@ def beyond(
     """
     trained, v_max = policy.config, float(policy.curriculum.v_max)
     schedule = setting.schedule
-    asked = _commanded(schedule, trained) if schedule else [tuple(command)]
+    asked = _commanded(schedule, trained, setting.heading) if schedule else [tuple(command)]
     reasons = _command_reasons(trained, v_max, asked)
     shortest = trained.command.shortest_seconds or trained.command.resample_seconds
     if schedule and _pace(schedule) < shortest - TOLERANCE:
@@ -46,10 +47,25 @@ def beyond(
     return {"beyond": reasons} if reasons else {}
 
 
-def _commanded(schedule: Schedule, trained: Config) -> list[tuple[float, float, float]]:
-    if schedule.steps:
-        return [(step.vx, step.vy, step.yaw_rate) for step in schedule.steps]
-    return [(schedule.low, 0.0, 0.0), (schedule.top, 0.0, 0.0)]
+def _commanded(
+    schedule: Schedule, trained: Config, facing: float
+) -> list[tuple[float, float, float]]:
+    """vx, vy [m/s] and yaw rate [rad/s] of each command, of a robot that begins at `facing` [rad].
+
+    A step with a heading asks for the yaw rate with which the turn to it begins.
+    """
+    if not schedule.steps:
+        return [(schedule.low, 0.0, 0.0), (schedule.top, 0.0, 0.0)]
+    asked, most = [], trained.command.max_yaw_rate
+    for step in 2 * schedule.steps:  # the list repeats
+        rate = step.yaw_rate
+        facing += rate * step.seconds
+        if step.heading is not None:
+            turn = math.remainder(step.heading - facing, 2 * math.pi)
+            rate = max(-most, min(most, trained.command.heading_gain * turn))
+            facing = step.heading
+        asked.append((step.vx, step.vy, rate))
+    return asked
 
 
 def _pace(schedule: Schedule) -> float:
