@@ -82,7 +82,7 @@ def sample(
 
 
 def width(config: CommandConfig, vx: jax.Array | float) -> jax.Array:
-    """Share [] of the ranges of vy and of heading changes from which commands with vx [m/s] are."""
+    """Share [] of the ranges of vy and of heading changes that commands with vx [m/s] may use."""
     if config.narrow_speed == 0:
         return jnp.ones(())
     return jnp.clip(1.0 - jnp.abs(vx) / config.narrow_speed, 0.0, 1.0)

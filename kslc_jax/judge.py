@@ -151,12 +151,13 @@ def side_by_side(kept: dict[str, Results]):
 
 
 def _unlike(kept: list[Results]) -> list[str]:
-    """Names of the conditions that differ between the contents of files of --json."""
-    conditions = [one.get("size", {}) | {k: one.get(k) for k in ("robot", "seed")} for one in kept]
-    names = dict.fromkeys(name for one in conditions for name in one)
-    return [
-        name for name in names if any(c.get(name) != conditions[0].get(name) for c in conditions)
-    ]
+    """Names of the conditions that differ between the files of --json that tell them."""
+    found: dict[str, list[Any]] = {}
+    for one in kept:
+        told = {name: one[name] for name in ("robot", "seed") if name in one}
+        for name, value in (told | one.get("size", {})).items():
+            found.setdefault(name, []).append(value)
+    return [name for name, values in found.items() if any(v != values[0] for v in values)]
 
 
 def _report(args: Args, path: Path) -> None:

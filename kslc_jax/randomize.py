@@ -53,9 +53,14 @@ def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
     )
 
 
+def lacks_arms(config: RandomizeConfig, robot: Robot) -> bool:
+    """True if arms are to be held, and the robot has none."""
+    return config.held_arms > 0.0 and not robot.is_arm.any()
+
+
 def require(config: RandomizeConfig, robot: Robot) -> None:
     """ConfigError if the trunk could become too light, or if the robot has no arms to be held."""
-    if config.held_arms and not robot.is_arm.any():
+    if lacks_arms(config, robot):
         raise ConfigError(f"held arms: {robot.name} has no arms; leave them out")
     trunk = float(robot.mj_model.body_mass[robot.trunk_body_id])
     left = trunk * config.link_mass[0] + config.base_mass[0]

@@ -48,7 +48,6 @@ from kslc_jax.evaluation.perturbations import (
     changes,
     disturbed,
     left_out,
-    settings,
     terrain,
 )
 
@@ -162,19 +161,16 @@ def setting(args: Args, physics: PhysicsConfig, condition: str) -> "Setting":
     """The setting of the trials under one condition."""
     from kslc_jax.evaluation import trials
 
-    made = changes(condition)
-    if "terrain" in made:
-        physics = dataclasses.replace(physics, terrain=made.pop("terrain"))
     plain = trials.Setting(
         physics,
+        randomize=disturbed(trials.NOMINAL, args.punch, args.hold_arms),
         seconds=args.seconds,
         noise=args.noise,
         latency=args.latency,
         heading=args.heading[0],
         simulate=options.simulator(args.engine),
     )
-    randomize = disturbed(plain.randomize, args.punch, args.hold_arms)
-    return dataclasses.replace(plain, **settings(made, randomize))
+    return trials.under(plain, condition)
 
 
 CONDITIONS = (

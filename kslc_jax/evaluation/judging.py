@@ -12,7 +12,6 @@ from kslc_jax.evaluation import (
     bars,
     gait_metrics,
     options,
-    perturbations,
     scheduled,
     schedules,
     trained,
@@ -148,7 +147,8 @@ PARTS = {
 
 
 def _part(told: Told, index: int, count: int) -> Told:
-    """Takes the share of the condition number `index` of `count` conditions."""
+    """A function for the condition number `index` of `count`: it takes the share of it that is
+    done, and reports the share of all conditions."""
     return lambda share: told((index + share) / count)
 
 
@@ -166,10 +166,8 @@ def _tried(
     def speed(trace, command: float, robot: Robot, dt: float) -> dict[str, float]:
         return gait_metrics.speed(trace, command, dt)
 
-    made = perturbations.changes(condition)
-    engine = trials.engine(policy, "high", made.pop("terrain", None))
-    plain = trials.Setting(engine, seconds=seconds)
-    setting = dataclasses.replace(plain, **perturbations.settings(made, plain.randomize))
+    plain = trials.Setting(trials.engine(policy, "high"), seconds=seconds)
+    setting = trials.under(plain, condition)
     rows = measuring.measure(policy, setting, commanded, seeds, seed, told, speed)
     return _marked(rows, policy, setting)
 

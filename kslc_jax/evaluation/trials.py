@@ -26,7 +26,7 @@ from kslc_jax.config import (
     TerrainConfig,
 )
 from kslc_jax.curriculum import Curriculum
-from kslc_jax.evaluation import schedules, variation
+from kslc_jax.evaluation import perturbations, schedules, variation
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.evaluation.schedules import Leg, Schedule
 from kslc_jax.evaluation.variation import Body
@@ -126,6 +126,15 @@ def engine(
             )
         return HighFidelity(robot=trained.robot, terrain=terrain, decimation=round(exact))
     return dataclasses.replace(trained, terrain=terrain)
+
+
+def under(setting: Setting, condition: str) -> Setting:
+    """The setting with the changes of a condition, such as "payload=5" or "rough:0.05"."""
+    made, engine = perturbations.changes(condition), setting.physics
+    if "terrain" in made:
+        engine = dataclasses.replace(engine, terrain=made.pop("terrain"))
+    changed = perturbations.settings(made, setting.randomize)
+    return dataclasses.replace(setting, physics=engine, **changed)
 
 
 def require(setting: Setting, robot: Robot) -> None:

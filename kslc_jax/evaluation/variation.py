@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from kslc_jax import maths, similar
+from kslc_jax import maths, randomize, similar
 from kslc_jax.config import ConfigError, RandomizeConfig
 from kslc_jax.evaluation import perturbations
 from kslc_jax.evaluation.perturbations import Variation
@@ -54,8 +54,8 @@ def for_robot(conditions: Sequence[str], robot: Robot) -> tuple[str, ...]:
 def _possible(changes: dict[str, Any], robot: Robot) -> bool:
     """True if the robot can have the `perturbations.changes` of a condition."""
     made = perturbations.settings(changes, RandomizeConfig())
-    held = made["randomize"].held_arms > 0.0 and not robot.is_arm.any()
-    return not held and not _lacking(made.get("variation", Variation()), robot)
+    armless = randomize.lacks_arms(made["randomize"], robot)
+    return not armless and not _lacking(made.get("variation", Variation()), robot)
 
 
 def require(variation: Variation, robot: Robot) -> None:
