@@ -58,6 +58,7 @@ def robot_for(config: PhysicsConfig) -> Robot:
         timestep=config.timestep,
         iterations=config.iterations,
         ls_iterations=config.ls_iterations,
+        cone=config.cone,
         terrain=config.uneven,
     )
 

@@ -15,13 +15,19 @@ import mujoco
 import numpy as np
 
 from kslc_jax import ground
-from kslc_jax.config import XBOT_L, Fidelity, TerrainConfig
+from kslc_jax.config import XBOT_L, Cone, Fidelity, TerrainConfig
 from kslc_jax.robots import anatomy, build, description, floors
 from kslc_jax.robots.anatomy import Anatomy
 
 SOLE_RISE = 0.02
 """Height that a sole's contact point gains per distance that it moves inwards. Half a millimetre
 decides which points of a flat foot carry the load."""
+
+
+_CONES = {
+    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +130,7 @@ def load(
     timestep: float | None = None,
     iterations: int | None = None,
     ls_iterations: int | None = None,
+    cone: Cone | None = None,
     name: str = XBOT_L,
     terrain: TerrainConfig | None = None,
 ) -> Robot:
@@ -134,6 +141,7 @@ def load(
       timestep: physics step [s]. None: default of the fidelity.
       iterations: Newton iterations of the contact solver. None: default of the fidelity.
       ls_iterations: line-search iterations. None: default of the fidelity.
+      cone: shape of the friction cone. None: default of the fidelity.
       name: a shipped robot, or the path of a description.
       terrain: uneven ground, in place of the flat floor.
 
@@ -146,6 +154,7 @@ def load(
     model.opt.timestep = timestep or model.opt.timestep
     model.opt.iterations = iterations or model.opt.iterations
     model.opt.ls_iterations = ls_iterations or model.opt.ls_iterations
+    model.opt.cone = _CONES[cone] if cone else model.opt.cone
     # A diverged simulation must show NaN. MuJoCo's automatic reset would hide it.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     # motors.motor_torque applies the torque limits, which depend on joint speed. The engine must

@@ -21,6 +21,7 @@ from kslc_jax.config.options import options
 from kslc_jax.config.physics import (
     GROUNDS,
     XBOT_L,
+    Cone,
     Fidelity,
     HighFidelity,
     PhysicsConfig,
@@ -48,6 +49,7 @@ __all__ = [
     "SCHEMA_VERSION",
     "XBOT_L",
     "CommandConfig",
+    "Cone",
     "Config",
     "ConfigError",
     "CurriculumConfig",

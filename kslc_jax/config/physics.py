@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 from kslc_jax.config.checks import require
 
 Fidelity = Literal["train", "high"]
+Cone = Literal["pyramidal", "elliptic"]
 
 XBOT_L = "xbot_l"
 """The robot of the paper. Presets are made for it."""
@@ -81,6 +82,10 @@ class PhysicsConfig:
     inertia blow up (docs/fidelity_physics.md)."""
     ls_iterations: int = 5
     """Line-search iterations of the contact solver."""
+    cone: Cone = "pyramidal"
+    """Shape of the friction cone. Friction in an elliptic cone is the same in all directions. A
+    pyramid inside it has down to 0.71 of this friction, so robots slip sooner
+    (docs/fidelity_physics.md). Elliptic cones need about 20 line-search iterations."""
     threads: int = 0
     """CPU threads of the mujoco engine; 0: all CPUs that this process may use. Does not change
     results."""
@@ -115,6 +120,7 @@ class HighFidelity(PhysicsConfig):
     decimation: int = 10
     iterations: int = 100
     ls_iterations: int = 50
+    cone: Cone = "elliptic"
 
     def __post_init__(self):
         super().__post_init__()

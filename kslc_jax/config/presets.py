@@ -76,6 +76,7 @@ _LAPTOP = _override(
         "cycle_from_speed": 0.5,
         "random_phase": True,
     },
+    physics={"iterations": 5, "ls_iterations": 20, "cone": "elliptic"},
     curriculum={
         "settle_seconds": 2.0,
         "v_limit": 4.0,
