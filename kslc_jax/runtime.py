@@ -11,6 +11,7 @@ import logging
 import os
 import statistics
 import sys
+import threading
 import time
 import warnings
 from collections import deque
@@ -282,7 +283,9 @@ def check_jax(version: str, backend: str) -> None:
 class Watchdog:
     """Prints the stack of every thread to stderr if a step takes far longer than those before.
 
-    A thread of faulthandler waits and prints. It runs even if Python's threads cannot run.
+    A thread of Python counts the time and prints. So a pause of the whole process does not count,
+    as when a laptop sleeps. A timer of faulthandler would count it, and would read the stacks while
+    the program runs: that ended a training by a segmentation fault.
     """
 
     def __init__(self, factor: float = 20.0, least: float = 60.0, first: float = 600.0):
@@ -298,10 +301,22 @@ class Watchdog:
     @contextlib.contextmanager
     def step(self) -> Generator[None]:
         """Watches one step."""
-        start = time.monotonic()
-        faulthandler.dump_traceback_later(self.limit(), file=2)
+        start, over = time.monotonic(), threading.Event()
+        threading.Thread(target=_report, args=(over, self.limit()), daemon=True).start()
         try:
             yield
         finally:
-            faulthandler.cancel_dump_traceback_later()
+            over.set()
             self._seconds.append(time.monotonic() - start)
+
+
+def _report(over: threading.Event, limit: float) -> None:
+    """Prints the stacks, unless `over` is set before the process has run for `limit` seconds."""
+    ticks = 20
+    for _ in range(ticks):
+        if over.wait(limit / ticks):
+            return
+    with contextlib.suppress(OSError, ValueError):  # no stderr, or a closed one
+        print(f"this step takes longer than {limit:.0f} s; all threads:", file=sys.stderr)
+        sys.stderr.flush()
+        faulthandler.dump_traceback(file=2)
