@@ -38,6 +38,7 @@ class XBot(gymnasium.Env[Observation, np.ndarray]):
             config.physics.timestep,
             config.physics.iterations,
             config.physics.ls_iterations,
+            config.physics.cone,
             config.physics.robot,
         )
         frames = observations.actor_table(self.robot), observations.critic_table(self.robot)

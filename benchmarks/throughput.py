@@ -4,11 +4,14 @@ It runs in turn: physics alone (random actions), the rollout, and the whole trai
 
   python -m benchmarks.throughput [--preset laptop] [--repeats 5] [--engines mujoco mjx]
 
-With --robot it runs in turn the whole train step of that robot and of XBot-L.
+With --robot it runs in turn the whole train step of XBot-L and of that robot; with --cones, that of
+elliptic friction cones and of pyramids.
 
   python -m benchmarks.throughput --robot unitree_g1 --engines mujoco
+  python -m benchmarks.throughput --cones
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,35 +96,45 @@ class Args:
     """Physics engines to compare."""
     robot: str | None = None
     """Robot to compare with XBot-L: a shipped one, or the path of a description."""
+    cones: bool = False
+    """Compare the preset's elliptic cones with pyramids, 4 iterations and 5 of the line search."""
     json: Path | None = None
     """File for the numbers."""
 
 
-def robots(args: Args) -> None:
-    """Prints the control steps/s of whole training of XBot-L and of another robot."""
+def variants(args: Args, configs: dict[str, Config]) -> None:
+    """Prints the control steps/s of whole training of several configs, and their ratio to the
+    first."""
     rates: dict[str, dict[str, float]] = {}
     for engine in args.engines:
-        runs, sizes = {}, {}
-        for robot in (XBOT_L, args.robot or XBOT_L):
-            config = timing.resized(similar.preset(args.preset, robot), args.num_envs)
-            name = physics.robot_for(config.physics).name
-            runs[name] = training(timing.on_engine(config, engine))
-            sizes[name] = config.batch_size
+        runs = {name: training(timing.on_engine(c, engine)) for name, c in configs.items()}
         seconds = timing.medians(timing.in_turn(runs, args.repeats))
-        rates[engine] = {name: sizes[name] / s for name, s in seconds.items()}
-        xbot = next(iter(rates[engine].values()))
+        rates[engine] = {name: c.batch_size / seconds[name] for name, c in configs.items()}
+        first = next(iter(configs))
         for name, rate in rates[engine].items():
-            ratio = rate / xbot
-            print(f"{engine:8} {name:16} {rate:9.0f} steps/s   {ratio:5.2f} of XBot-L", flush=True)
+            ratio = rate / rates[engine][first]
+            print(f"{engine:8} {name:16} {rate:9.0f} steps/s   {ratio:5.2f} of {first}", flush=True)
     timing.report({"preset": args.preset, "steps_per_second": rates}, args.json)
+
+
+def robots(args: Args, robot: str) -> dict[str, Config]:
+    """XBot-L and another robot."""
+    made = [similar.preset(args.preset, name) for name in (XBOT_L, robot)]
+    return {physics.robot_for(c.physics).name: timing.resized(c, args.num_envs) for c in made}
+
+
+def cones(base: Config) -> dict[str, Config]:
+    """A config with both shapes of the friction cone."""
+    pyramid = dataclasses.replace(base.physics, cone="pyramidal", iterations=4, ls_iterations=5)
+    return {"elliptic": base, "pyramidal": dataclasses.replace(base, physics=pyramid)}
 
 
 def main(args: Args) -> None:
     """Prints a table."""
-    if args.robot is not None:
-        robots(args)
-        return
     base = timing.resized(preset(args.preset), args.num_envs)
+    if args.robot is not None or args.cones:
+        variants(args, cones(base) if args.robot is None else robots(args, args.robot))
+        return
     results = {}
     for engine in args.engines:
         results[engine] = measure(timing.on_engine(base, engine), args.repeats)

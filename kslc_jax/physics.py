@@ -11,6 +11,7 @@ environment.
 """
 
 import contextlib
+import copy
 import functools
 import io
 import threading
@@ -26,6 +27,7 @@ import numpy as np
 
 with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a notice about an optional backend
     from mujoco import mjx
+    from mujoco.mjx._src import constraint as mjx_rows
 
 from kslc_jax import ground as ground_lib
 from kslc_jax import processors
@@ -170,7 +172,42 @@ def _home_sensordata(config: PhysicsConfig) -> np.ndarray:
 @functools.lru_cache(maxsize=8)
 def _mjx_model(config: PhysicsConfig) -> mjx.Model:
     with jax.ensure_compile_time_eval():
-        return mjx.put_model(robot_for(config).mj_model, device=_own_device(), impl="jax")
+        model = mjx.put_model(robot_for(config).mj_model, device=_own_device(), impl="jax")
+    fewer = max(FEW_SEARCHES, config.ls_iterations // 4)
+    return model.replace(opt=model.opt.replace(ls_iterations=min(config.ls_iterations, fewer)))
+
+
+FEW_SEARCHES = 5
+"""MJX takes a quarter of the line-search iterations of C MuJoCo, but at least so many. It tries
+three points in each: with 5 it makes the same error as C with 20 (docs/fidelity_physics.md)."""
+
+
+def _blank_data(model: mujoco.MjModel) -> mjx.Data:
+    """MJX's data before a step.
+
+    MJX's solver has elliptic cones beside contacts without friction, but `mjx.make_data` refuses
+    them. So this makes data for pyramids, and then lays out the rows of the constraints anew.
+    """
+    pyramids = copy.copy(model)
+    pyramids.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
+    data = mjx.make_data(pyramids, device=_own_device(), impl="jax")
+    if model.opt.cone == pyramids.opt.cone:
+        return data
+    of_jax = data._impl
+    kinds = mjx_rows.make_efc_type(model, of_jax.contact.dim)
+    address = mjx_rows.make_efc_address(model, of_jax.contact.dim, kinds)
+    rows = {
+        name: jnp.zeros((kinds.size, *getattr(of_jax, name).shape[1:]), of_jax.efc_D.dtype)
+        for name in ("efc_J", *(f"efc_{n}" for n in _ROW))
+    }
+    contact = of_jax.contact.replace(efc_address=address)
+    return data.replace(
+        _impl=of_jax.replace(nefc=kinds.size, efc_type=kinds, contact=contact, **rows)
+    )
+
+
+_ROW = ("pos", "margin", "frictionloss", "D", "aref", "force")
+"""What MJX's data have one number of for each row of the constraints."""
 
 
 def _own_device() -> jax.Device:
@@ -189,7 +226,7 @@ def _step_mjx(
 ) -> PhysicsState:
     robot = robot_for(config)
     model = _mjx_model(config).replace(**fields)
-    blank = mjx.make_data(robot.mj_model, device=_own_device(), impl="jax")
+    blank = _blank_data(robot.mj_model)
     data = blank.replace(
         qpos=state.qpos.astype(blank.qpos.dtype),  # under x64 the state need not be float64
         qvel=state.qvel.astype(blank.qvel.dtype),

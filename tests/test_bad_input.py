@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 import kslc_jax.evaluation
@@ -29,6 +29,7 @@ from kslc_jax import (
     doctor,
     evaluate,
     export,
+    falls,
     files,
     judge,
     learning,
@@ -107,6 +108,7 @@ class TestTrain:
 
     @settings(few, max_examples=3)  # each traces a training
     @given(st.sampled_from([*SIZES, "network.actor"]), st.integers(2**34, 2**70))
+    @example("env.privileged-frames", 2**63 // 100)  # 50 numbers a frame: 2^63 inputs
     def test_sizes_beyond_any_memory(self, run_dir, name, value):
         said = self.refused(run_dir, f"--{name}", 2 * value)
         assert name.replace("-", "_") in said or "network sizes" in said
@@ -280,7 +282,11 @@ class TestTrialOptions:
 
 
 @pytest.mark.usefixtures("any_renderer")
-@pytest.mark.parametrize(("main", "more"), [*COMMANDS, (judge.main, ())], ids=[*NAMES, "judge"])
+@pytest.mark.parametrize(
+    ("main", "more"),
+    [*COMMANDS, (judge.main, ()), (falls.main, ())],
+    ids=[*NAMES, "judge", "falls"],
+)
 class TestPolicyAndSeed:
     @few
     @given(word=words)

@@ -136,7 +136,8 @@ def test_our_additions_are_off_in_the_paper():
 
 def test_physics_departs_from_humanoid_gym_at_the_same_control_rate():
     p = PAPER.physics
-    assert (p.timestep, p.decimation, p.iterations, p.ls_iterations) == (0.005, 2, 4, 5)
+    assert (p.timestep, p.decimation) == (0.005, 2)
+    assert (p.cone, p.iterations, p.ls_iterations) == ("elliptic", 5, 20)
     assert {preset(name).physics for name in PRESETS} == {p}
 
 
@@ -144,7 +145,7 @@ def test_evaluation_physics():
     """Physics at 1 kHz with a converged solver; the policy still runs at 100 Hz. C MuJoCo only."""
     high = HighFidelity()
     assert (high.timestep, high.decimation, high.fidelity) == (0.001, 10, "high")
-    assert (high.iterations, high.ls_iterations) == (100, 50)
+    assert (high.cone, high.iterations, high.ls_iterations) == ("elliptic", 100, 50)
     assert high.control_dt == pytest.approx(PAPER.control_dt)
     with pytest.raises(ConfigError, match=r"physics\.engine"):
         HighFidelity(engine="mjx")
@@ -549,6 +550,7 @@ def test_seed_must_not_be_negative():
 
 
 LATER_FIELDS = {
+    "physics.cone": "pyramidal",
     "command.slow_fraction": 0.0,
     "command.slow_speed": 1.0,
     "command.brake_fraction": 0.0,
@@ -579,7 +581,8 @@ LATER_FIELDS = {
 def test_fields_that_older_files_lack_have_their_default(path, then):
     assert operator.attrgetter(path)(Config()) == then
     back = from_dict(edited(path, remove=True))
-    assert back == PAPER and back.run == PAPER.run
+    expected = from_dict(edited(path, then))
+    assert back == expected and back.run == expected.run
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -301,6 +301,7 @@ def test_options_and_their_overrides(xbot):
     other = robot.load("train", timestep=0.002, iterations=7, ls_iterations=9)
     opt = other.mj_model.opt
     assert (opt.timestep, opt.iterations, opt.ls_iterations) == (0.002, 7, 9)
+    assert robot.load(cone="elliptic").mj_model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
     assert robot.load("train", timestep=0.002, iterations=7, ls_iterations=9) is other
     assert robot.load() is xbot and xbot.mj_model.opt.timestep == 0.005
 

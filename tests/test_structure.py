@@ -24,7 +24,9 @@ def _name(path: Path) -> str:
 MODULES = {_name(path): path for path in sorted(ROOT.rglob("*.py"))}
 
 WINGS = ("kslc_jax.evaluation", "kslc_jax.viewer", "kslc_jax.checkup")
-COMMANDS = tuple(f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "judge", "play", "export"))
+COMMANDS = tuple(
+    f"kslc_jax.{name}" for name in ("evaluate", "sim2sim", "judge", "falls", "play", "export")
+)
 NO_TRAINING = [n for n in MODULES if n.startswith(WINGS) or n in ("kslc_jax.policy", *COMMANDS)]
 
 OPTIONAL = {"kslc_jax.evaluation.drake": "pydrake", "kslc_jax.viewer.app": "viser"}

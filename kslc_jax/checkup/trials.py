@@ -92,7 +92,7 @@ def engines_apart(config: PhysicsConfig) -> float:
 
 def joint_angles(engine: Literal["mujoco", "mjx"], config: PhysicsConfig) -> np.ndarray:
     """Joint angles [n, rad] after `AGREEMENT_STEPS` control steps from home."""
-    config = dataclasses.replace(config, engine=engine, iterations=10, ls_iterations=10)
+    config = dataclasses.replace(config, engine=engine, iterations=10, ls_iterations=50)
     robot = physics.robot_for(config)
     home = jnp.asarray(robot.default_qpos, jnp.float32)
     start = physics.initial_state(config, home, jnp.zeros(home.size - 1))

@@ -28,6 +28,11 @@ def require_seed(seed: int, name: str = "seed") -> None:
     require(0 <= seed < COUNTER, f"{name} must lie in [0, 2^31), not {seed}")
 
 
+LARGEST = 2**44
+"""Largest number of a config. The frames of a window become one axis of a network's input, so the
+product of two numbers must be a size of an array, below 2^63."""
+
+
 def check_numbers(name: str, value: object) -> None:
     """Raises ConfigError for numbers that are not finite, or too large for an array shape."""
     if dataclasses.is_dataclass(value):
@@ -37,7 +42,7 @@ def check_numbers(name: str, value: object) -> None:
         for part in value:
             check_numbers(name, part)
     elif isinstance(value, int | float):
-        require(abs(value) < 2**62, f"{name}: {value} is too large or not finite")
+        require(abs(value) < LARGEST, f"{name}: {value} is too large or not finite")
 
 
 def check_range(name: str, value: Range) -> None:

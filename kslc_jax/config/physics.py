@@ -81,7 +81,7 @@ class PhysicsConfig:
     """Newton iterations of the contact solver. With fewer than 4, joints of XBot-L without rotor
     inertia blow up (docs/fidelity_physics.md)."""
     ls_iterations: int = 5
-    """Line-search iterations of the contact solver."""
+    """Line-search iterations of the contact solver. mjx takes a quarter, but at least 5."""
     cone: Cone = "pyramidal"
     """Shape of the friction cone. Friction in an elliptic cone is the same in all directions. A
     pyramid inside it has down to 0.71 of this friction, so robots slip sooner

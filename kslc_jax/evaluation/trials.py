@@ -223,12 +223,8 @@ def run(
       chunk: duration of a piece [s].
     """
     count = len(velocities)
-    # One compiled program serves all values of these two fields.
-    compiled = dataclasses.replace(setting, seconds=0.0, heading=0.0)
-    start, advance = _programs(policy.config, compiled, count, env.step)
-    legs = jnp.asarray(velocities, jnp.float32), jnp.float32(setting.heading)
-    key_reset, key_run = jax.random.split(jax.random.key(seed))
-    carry = start(policy.curriculum, *legs, jax.random.split(key_reset, count))
+    _, advance = _programs(policy.config, _compiled(setting), count, env.step)
+    carry, key_run = _begin(policy, setting, velocities, seed)
     # On a named device, like the loaded parameters. Else the second piece compiles again.
     carry = jax.device_put(carry, jax.devices()[0])
     steps = round(chunk / setting.physics.control_dt)
@@ -236,6 +232,26 @@ def run(
         step_keys = jax.random.split(jax.random.fold_in(key_run, i), steps)
         carry, trace = advance(policy.params, policy.curriculum, carry, step_keys)
         yield jax.tree.map(np.asarray, trace)
+
+
+def drawn(policy: Policy, setting: Setting, count: int, seed: int) -> randomize.Dynamics:
+    """How the `count` robots [count, ...] of `run` with this seed differ from the described one."""
+    start, _ = _begin(policy, setting, np.zeros((count, 3)), seed)
+    return start.env.dynamics
+
+
+def _begin(policy: Policy, setting: Setting, velocities: np.ndarray, seed: int):
+    """(trials before the first step [N, ...], random key of the steps)."""
+    start, _ = _programs(policy.config, _compiled(setting), len(velocities), env.step)
+    legs = jnp.asarray(velocities, jnp.float32), jnp.float32(setting.heading)
+    key_reset, key_run = jax.random.split(jax.random.key(seed))
+    keys = jax.random.split(key_reset, len(velocities))
+    return start(policy.curriculum, *legs, keys), key_run
+
+
+def _compiled(setting: Setting) -> Setting:
+    """The setting without the fields of which one compiled program serves all values."""
+    return dataclasses.replace(setting, seconds=0.0, heading=0.0)
 
 
 @functools.lru_cache(maxsize=4)
