@@ -19,6 +19,7 @@ Examples:
   python -m kslc_jax.falls xbot_l_run --schedule jitter --top 3.5 --json falls.json
 """
 
+import functools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +33,8 @@ from kslc_jax.config import ConfigError, Fidelity, require_seed
 from kslc_jax.evaluation import options, tables
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from kslc_jax.evaluation.schedules import Schedule
     from kslc_jax.policy import Policy
 
@@ -114,7 +117,7 @@ def table(found: dict[str, dict[str, Any]], title: str):
     for fidelity, of in found.items():
         told = ", ".join(f"{name} ({times})" for name, times in of["commands"])
         first = (fidelity, f"{of['fell']:.0%} of {of['robots']}", told)
-        nothing = {"name": "no number" if of["falls"] else "-", "shares": ()}
+        nothing: dict[str, Any] = {"name": "no number" if of["falls"] else "-", "shares": ()}
         for i, suspect in enumerate(of["suspects"] or [nothing]):
             shares = (f"{share:.0%}" for share in suspect["shares"])
             out.add_row(*(first if i == 0 else ("", "", "")), escape(suspect["name"]), *shares)
@@ -143,16 +146,18 @@ def _report(args: Args) -> None:
         for name in args.fidelity:
             bar.start_task(tasks[name])
 
-            def progress(share: float, name: str = name) -> None:
-                bar.update(tasks[name], completed=share)
-
-            found[name] = measure(policy, args, schedule, name, progress)
+            told = functools.partial(_advance, bar, tasks[name])
+            found[name] = measure(policy, args, schedule, name, told)
     title = f"{args.policy}, train step {policy.step}, schedule {schedule.name}"
     screen.print(table(found, f"{title} to {schedule.top:g} m/s, {args.seconds:g} s"))
     if args.json is not None:
         about = {"policy": policy_name(args.policy), "step": policy.step}
         asked = {"schedule": schedule.name, "top": schedule.top, "seconds": args.seconds}
         files.write_json(args.json, about | asked | {"seed": args.seed, "fidelities": found})
+
+
+def _advance(bar: "Progress", task: "TaskID", share: float) -> None:
+    bar.update(task, completed=share)
 
 
 if __name__ == "__main__":

@@ -193,7 +193,7 @@ def _blank_data(model: mujoco.MjModel) -> mjx.Data:
     data = mjx.make_data(pyramids, device=_own_device(), impl="jax")
     if model.opt.cone == pyramids.opt.cone:
         return data
-    of_jax = data._impl
+    of_jax: Any = data._impl
     kinds = mjx_rows.make_efc_type(model, of_jax.contact.dim)
     address = mjx_rows.make_efc_address(model, of_jax.contact.dim, kinds)
     rows = {
