@@ -9,6 +9,7 @@ process hangs or fails.
   python -m benchmarks.start_test [--starts 200]
 """
 
+import dataclasses
 import faulthandler
 import subprocess
 import sys
@@ -41,7 +42,7 @@ def rollout(engine: Engine, threads: int) -> None:
     from kslc_jax import config, curriculum, env, motors, networks, physics
 
     cfg = config.preset("debug")
-    simulator = config.PhysicsConfig(engine=engine, threads=threads)
+    simulator = dataclasses.replace(cfg.physics, engine=engine, threads=threads)
 
     @jax.jit
     def run(key: jax.Array) -> jax.Array:

@@ -23,7 +23,7 @@ import tyro
 from benchmarks import timing
 from kslc_jax import motors, physics, similar, train_step
 from kslc_jax import rollout as rollout_lib
-from kslc_jax.config import XBOT_L, Config, preset
+from kslc_jax.config import XBOT_L, Config, PhysicsConfig, preset
 
 
 def physics_only(config: Config) -> Callable[[], Any]:
@@ -97,7 +97,8 @@ class Args:
     robot: str | None = None
     """Robot to compare with XBot-L: a shipped one, or the path of a description."""
     cones: bool = False
-    """Compare the preset's elliptic cones with pyramids, 4 iterations and 5 of the line search."""
+    """Compare the preset's elliptic cones with the pyramids of older runs, and their iterations;
+    with --robot, for that robot."""
     json: Path | None = None
     """File for the numbers."""
 
@@ -117,23 +118,21 @@ def variants(args: Args, configs: dict[str, Config]) -> None:
     timing.report({"preset": args.preset, "steps_per_second": rates}, args.json)
 
 
-def robots(args: Args, robot: str) -> dict[str, Config]:
-    """XBot-L and another robot."""
-    made = [similar.preset(args.preset, name) for name in (XBOT_L, robot)]
-    return {physics.robot_for(c.physics).name: timing.resized(c, args.num_envs) for c in made}
-
-
 def cones(base: Config) -> dict[str, Config]:
     """A config with both shapes of the friction cone."""
-    pyramid = dataclasses.replace(base.physics, cone="pyramidal", iterations=4, ls_iterations=5)
-    return {"elliptic": base, "pyramidal": dataclasses.replace(base, physics=pyramid)}
+    before = PhysicsConfig(robot=base.physics.robot)  # the defaults are those of older runs
+    return {"elliptic": base, "pyramidal": dataclasses.replace(base, physics=before)}
 
 
 def main(args: Args) -> None:
     """Prints a table."""
-    base = timing.resized(preset(args.preset), args.num_envs)
-    if args.robot is not None or args.cones:
-        variants(args, cones(base) if args.robot is None else robots(args, args.robot))
+    base = timing.resized(similar.preset(args.preset, args.robot or XBOT_L), args.num_envs)
+    if args.cones:
+        variants(args, cones(base))
+        return
+    if args.robot is not None:
+        xbot = timing.resized(preset(args.preset), args.num_envs)
+        variants(args, {physics.robot_for(c.physics).name: c for c in (xbot, base)})
         return
     results = {}
     for engine in args.engines:

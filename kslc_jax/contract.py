@@ -120,10 +120,14 @@ def metadata(policy: Policy) -> dict[str, Any]:
 
 
 def mjcf(policy: Policy) -> str:
-    """The text of an MJCF: the training model of the policy's robot."""
+    """The text of an MJCF: the training model of the policy's robot, with the policy's physics."""
+    from kslc_jax import physics
     from kslc_jax.robots import build, description
 
     spec = build.spec(description.read(policy.config.physics.robot), "train")
+    trained = physics.robot_for(policy.config.physics).mj_model.opt
+    for name in ("timestep", "cone", "iterations", "ls_iterations"):
+        setattr(spec.option, name, getattr(trained, name))
     spec.compile()
     return spec.to_xml()
 

@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 
 from kslc_jax import cli, files, processors, runtime
-from kslc_jax.config import ConfigError, PhysicsConfig
+from kslc_jax.config import ConfigError, preset
 
 PYTHONS = ((3, 11), (3, 13))
 """Oldest and newest Python this is tested with."""
@@ -100,7 +100,7 @@ def check_engines() -> str:
     """The engines' versions, and the distance between their motions."""
     from kslc_jax.checkup import findings, trials
 
-    apart = trials.engines_apart(PhysicsConfig())
+    apart = trials.engines_apart(preset("laptop").physics)
     if math.isnan(apart):
         raise RuntimeError("an engine gives numbers that are not finite")
     if apart > findings.AGREEMENT:

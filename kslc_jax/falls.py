@@ -2,14 +2,14 @@
 
 Robots whose masses, motors and friction differ get random commands, with stops and reversals from
 the top speed: the same robots and the same commands in the engine of the training and at high
-fidelity. Prints for both which share of them fell, which commands came before, and the numbers that
-decide: those in which robots that fell differ from the others by 3 standard errors or more. For
-each it gives the share that fell of the quarter of robots with the least of it, and so on to the
-quarter with the most.
+fidelity. Prints for both which share of them fell, which commands came before (fast: above half of
+the top speed), and the numbers that go with falls. The robots are sorted by each number and cut
+into quarters. A number is listed if the quarters differ more than chance does once in a thousand,
+with the share that fell of each quarter.
 
-If more robots fall in the training than at high fidelity, the training is harder than what it
-prepares for; if fewer, it misses something. Either way the number that decides says where to look.
-More robots show more: with 64, only a strong effect stands out.
+If more robots fall in training than at high fidelity, training is harder than the judgement; if
+fewer, training misses something. The number that goes with the falls says where to look. More
+robots show more: with 64, only a strong effect stands out.
 
 POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
@@ -19,6 +19,7 @@ Examples:
   python -m kslc_jax.falls xbot_l_run --schedule jitter --top 3.5 --json falls.json
 """
 
+import dataclasses
 import functools
 import sys
 from collections.abc import Callable
@@ -36,9 +37,13 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from kslc_jax.evaluation.schedules import Schedule
+    from kslc_jax.evaluation.trials import Setting
     from kslc_jax.policy import Policy
 
 LEAST_ROBOTS = 16
+
+NEEDED = ("alive", "command", "leg")
+"""Fields of a trace that tell of falls."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class Args:
     seconds: float = 60.0
     """Length of a trial [s]."""
     fidelity: tuple[Fidelity, ...] = ("train", "high")
-    """train: the engine of the training. high: full C MuJoCo at 1 ms, some ten times slower."""
+    """train: the engine of the training. high: full C MuJoCo at 1 ms, several times slower."""
     schedule: str = "random"
     """Commands, as of sim2sim --schedule."""
     top: float | None = None
@@ -72,53 +77,65 @@ class Args:
         options.check_disturbances(0.0, self.top, scheduled=True)
 
 
-def measure(
-    policy: "Policy",
-    args: Args,
-    schedule: "Schedule",
-    fidelity: Fidelity,
-    progress: Callable[[float], None] = lambda share: None,
-) -> dict[str, Any]:
-    """What `suspects.report` says of the trials of one fidelity.
+def setting(policy: "Policy", args: Args, schedule: "Schedule", fidelity: Fidelity) -> "Setting":
+    """The setting of the trials at one fidelity. ConfigError if the policy cannot be tried so."""
+    from kslc_jax.evaluation import judging, trials
 
-    It calls `progress` with the share [] that is done.
-    """
-    import numpy as np
-
-    from kslc_jax.evaluation import judging, reaction, suspects, trials
-
-    setting = trials.Setting(
+    return trials.Setting(
         trials.engine(policy, fidelity),
         randomize=judging.robots_that_differ(policy.config.physics.robot),
         seconds=args.seconds,
         schedule=schedule,
     )
-    pieces, commands = [], np.zeros((args.robots, 3))
-    for piece in trials.run(policy, setting, commands, args.seed):
-        pieces.append(piece)
-        progress(len(pieces) / args.seconds)
+
+
+def measure(
+    policy: "Policy",
+    setting: "Setting",
+    robots: int,
+    seed: int,
+    progress: Callable[[float], None] = lambda share: None,
+) -> dict[str, Any]:
+    """What `suspects.report` says of the trials of one setting, which has a schedule.
+
+    It calls `progress` with the share [] that is done.
+    """
+    import numpy as np
+
+    from kslc_jax import physics
+    from kslc_jax.evaluation import reaction, suspects, trials
+
+    assert setting.schedule
+    pieces = []
+    for piece in trials.run(policy, setting, np.zeros((robots, 3)), seed):
+        rest = (field.name for field in dataclasses.fields(piece) if field.name not in NEEDED)
+        pieces.append(piece.replace(**dict.fromkeys(rest)))
+        progress(len(pieces) / setting.seconds)
     trace = trials.join(pieces)
     falls = reaction.falls(trace, setting.physics.control_dt)
-    drawn = trials.drawn(policy, setting, args.robots, args.seed)
-    return suspects.report(~np.asarray(trace.alive)[-1], drawn, falls)
+    drawn = trials.drawn(policy, setting, robots, seed)
+    can_matter = suspects.numbers(drawn, physics.robot_for(setting.physics))
+    fell = ~np.asarray(trace.alive)[-1]
+    return suspects.report(fell, can_matter, falls, setting.schedule.top)
 
 
 def table(found: dict[str, dict[str, Any]], title: str):
-    """Who fell, as a rich table: one line for each number that stands out."""
+    """Who fell, as a rich table: one line for each number that goes with the falls."""
     from rich.markup import escape
     from rich.table import Table
 
-    caption = "Quarters: of the robots with the least of the number, to those with the most."
-    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    for label in ("fidelity", "fell", "after commands [m/s]", "decides"):
-        out.add_column(escape(label))
+    caption = "Right: share that fell in each quarter of the robots, sorted by the number."
+    out = Table(title=escape(title), title_justify="left", caption=caption, caption_justify="left")
+    for label in ("fidelity", "fell", "after commands", "goes with"):
+        out.add_column(label)
     for label in ("least", "", "", "most"):
         out.add_column(label, justify="right")
     for fidelity, of in found.items():
         told = ", ".join(f"{name} ({times})" for name, times in of["commands"])
         first = (fidelity, f"{of['fell']:.0%} of {of['robots']}", told)
-        nothing: dict[str, Any] = {"name": "no number" if of["falls"] else "-", "shares": ()}
-        for i, suspect in enumerate(of["suspects"] or [nothing]):
+        nothing = {"name": "no number" if of["enough_to_tell"] else "too few to tell", "shares": ()}
+        lines: list[dict[str, Any]] = of["suspects"] or [nothing]
+        for i, suspect in enumerate(lines):
             shares = (f"{share:.0%}" for share in suspect["shares"])
             out.add_row(*(first if i == 0 else ("", "", "")), escape(suspect["name"]), *shares)
     return out
@@ -133,26 +150,28 @@ def _report(args: Args) -> None:
     """Tries the robots, prints the table, writes the numbers."""
     from rich.progress import Progress
 
+    from kslc_jax import physics
     from kslc_jax.evaluation import schedules
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
     policy = load_policy(args.policy)
     v_max = float(policy.curriculum.v_max)
-    schedule = schedules.named(args.schedule, policy.config, v_max, args.top)
+    plan = schedules.named(args.schedule, policy.config, v_max, args.top)
+    settings = {name: setting(policy, args, plan, name) for name in args.fidelity}
     screen, found = tables.console(), {}
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
-        tasks = {name: bar.add_task(name, total=1.0, start=False) for name in args.fidelity}
-        for name in args.fidelity:
+        tasks = {name: bar.add_task(name, total=1.0, start=False) for name in settings}
+        for name, conditions in settings.items():
             bar.start_task(tasks[name])
-
             told = functools.partial(_advance, bar, tasks[name])
-            found[name] = measure(policy, args, schedule, name, told)
-    title = f"{args.policy}, train step {policy.step}, schedule {schedule.name}"
-    screen.print(table(found, f"{title} to {schedule.top:g} m/s, {args.seconds:g} s"))
+            found[name] = measure(policy, conditions, args.robots, args.seed, told)
+    title = f"{args.policy}, train step {policy.step}, schedule {plan.name}"
+    screen.print(table(found, f"{title} to {plan.top:g} m/s, {args.seconds:g} s"))
     if args.json is not None:
-        about = {"policy": policy_name(args.policy), "step": policy.step}
-        asked = {"schedule": schedule.name, "top": schedule.top, "seconds": args.seconds}
+        robot = physics.robot_for(policy.config.physics).name
+        about = {"policy": policy_name(args.policy), "step": policy.step, "robot": robot}
+        asked = {"schedule": plan.name, "top": plan.top, "seconds": args.seconds}
         files.write_json(args.json, about | asked | {"seed": args.seed, "fidelities": found})
 
 

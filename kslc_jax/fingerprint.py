@@ -70,7 +70,8 @@ _COLLISION = (
 """Arrays `geom_NAME` of the geoms that can touch something."""
 
 _OPTIONS = ("gravity", "integrator", "cone", "solver", "impratio", "tolerance", "disableflags")
-"""Options of the simulation that `PhysicsConfig` does not contain."""
+"""Options of the simulation as the robot's file has them. `PhysicsConfig` contains the cone, too,
+since the presets have elliptic ones."""
 
 _MORE_OPTIONS = ("wind", "density", "viscosity", "ls_tolerance", "enableflags", "ccd_tolerance")
 """Further options. Older checkpoints do not have this group."""

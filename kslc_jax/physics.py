@@ -27,7 +27,6 @@ import numpy as np
 
 with contextlib.redirect_stdout(io.StringIO()):  # mjx prints a notice about an optional backend
     from mujoco import mjx
-    from mujoco.mjx._src import constraint as mjx_rows
 
 from kslc_jax import ground as ground_lib
 from kslc_jax import processors
@@ -173,26 +172,32 @@ def _home_sensordata(config: PhysicsConfig) -> np.ndarray:
 def _mjx_model(config: PhysicsConfig) -> mjx.Model:
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(robot_for(config).mj_model, device=_own_device(), impl="jax")
-    fewer = max(FEW_SEARCHES, config.ls_iterations // 4)
-    return model.replace(opt=model.opt.replace(ls_iterations=min(config.ls_iterations, fewer)))
+    if config.cone == "pyramidal":
+        return model
+    fewer = min(config.ls_iterations, max(FEW_SEARCHES, config.ls_iterations // 4))
+    return model.replace(opt=model.opt.replace(ls_iterations=fewer))
 
 
 FEW_SEARCHES = 5
-"""MJX takes a quarter of the line-search iterations of C MuJoCo, but at least so many. It tries
-three points in each: with 5 it makes the same error as C with 20 (docs/fidelity_physics.md)."""
+"""In elliptic cones MJX takes a quarter of `ls_iterations`, but not fewer than 5, unless fewer are
+asked for. It tries three points in each: with 5 it makes the same error as C MuJoCo with 20
+(docs/fidelity_physics.md)."""
 
 
 def _blank_data(model: mujoco.MjModel) -> mjx.Data:
     """MJX's data before a step.
 
     MJX's solver has elliptic cones beside contacts without friction, but `mjx.make_data` refuses
-    them. So this makes data for pyramids, and then lays out the rows of the constraints anew.
+    them (MJX 3.17). So this makes data for pyramids, and then lays out the rows of the constraints
+    anew. That needs a part of MJX that is not public.
     """
     pyramids = copy.copy(model)
     pyramids.opt.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
     data = mjx.make_data(pyramids, device=_own_device(), impl="jax")
     if model.opt.cone == pyramids.opt.cone:
         return data
+    from mujoco.mjx._src import constraint as mjx_rows
+
     of_jax: Any = data._impl
     kinds = mjx_rows.make_efc_type(model, of_jax.contact.dim)
     address = mjx_rows.make_efc_address(model, of_jax.contact.dim, kinds)

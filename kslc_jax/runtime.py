@@ -302,7 +302,8 @@ class Watchdog:
     def step(self) -> Generator[None]:
         """Watches one step."""
         start, over = time.monotonic(), threading.Event()
-        threading.Thread(target=_report, args=(over, self.limit()), daemon=True).start()
+        with contextlib.suppress(RuntimeError):  # there can be no more threads
+            threading.Thread(target=_report, args=(over, self.limit()), daemon=True).start()
         try:
             yield
         finally:
@@ -312,11 +313,10 @@ class Watchdog:
 
 def _report(over: threading.Event, limit: float) -> None:
     """Prints the stacks, unless `over` is set before the process has run for `limit` seconds."""
-    ticks = 20
+    ticks = 20  # a pause counts as one tick at most
     for _ in range(ticks):
         if over.wait(limit / ticks):
             return
-    with contextlib.suppress(OSError, ValueError):  # no stderr, or a closed one
-        print(f"this step takes longer than {limit:.0f} s; all threads:", file=sys.stderr)
-        sys.stderr.flush()
+    with contextlib.suppress(OSError):  # stderr is closed
+        os.write(2, f"this step takes longer than {limit:.0f} s; all threads:\n".encode())
         faulthandler.dump_traceback(file=2)

@@ -438,6 +438,10 @@ def test_the_copy_of_a_robot_in_a_package_is_its_description(tmp_path):
 
 def test_the_exported_model_is_the_robots(biped, untrained):
     again = mujoco.MjModel.from_xml_string(contract.mjcf(untrained))
+    trained = physics.robot_for(untrained.config.physics).mj_model.opt
+    assert trained.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+    for name in ("timestep", "cone", "iterations", "ls_iterations", "integrator", "solver"):
+        assert getattr(again.opt, name) == getattr(trained, name), name
     np.testing.assert_allclose(again.body_mass, biped.mj_model.body_mass, rtol=1e-5)
     np.testing.assert_allclose(again.actuator_gainprm[:, 0], biped.kp)
     assert [again.actuator(i).name for i in range(again.nu)] == list(biped.joint_names)

@@ -108,6 +108,7 @@ class TestTrain:
 
     @settings(few, max_examples=3)  # each traces a training
     @given(st.sampled_from([*SIZES, "network.actor"]), st.integers(2**34, 2**70))
+    @example("env.num-envs", 2**40)
     @example("env.privileged-frames", 2**63 // 100)  # 50 numbers a frame: 2^63 inputs
     def test_sizes_beyond_any_memory(self, run_dir, name, value):
         said = self.refused(run_dir, f"--{name}", 2 * value)
@@ -387,6 +388,7 @@ WRITERS = {
     "evaluate": "evaluate xbot_l_run --json OUT.json",
     "sim2sim": "sim2sim xbot_l_run --json OUT.json",
     "judge": "judge xbot_l_run --json OUT.json",
+    "falls": "falls xbot_l_run --json OUT.json",
     "strip": "play xbot_l_run --gait-strip OUT.png",
     "video": "play xbot_l_run --video OUT.webp",
     "export": "export xbot_l_run OUT.onnx",

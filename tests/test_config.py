@@ -18,6 +18,7 @@ from kslc_jax.config import (
     Config,
     ConfigError,
     HighFidelity,
+    RandomizeConfig,
     from_dict,
     preset,
     to_dict,
@@ -481,6 +482,7 @@ def test_unknown_names(name, without, message):
         ("gait", "full_speed", 0.0),
         ("randomize", "friction", (2.0, 0.1)),
         ("randomize", "friction", (-0.1, 0.1)),
+        ("randomize", "ground_friction", -0.1),
         ("randomize", "base_mass", (5.0, -5.0)),
         ("randomize", "kp", (-0.1, 1.0)),
         ("rewards", "momentum_scale", 0.0),
@@ -608,3 +610,10 @@ def test_options_name_only_what_differs():
     assert config_lib.options(debug) == ["--preset", "debug"]
     faster = dataclasses.replace(debug, ppo=dataclasses.replace(debug.ppo, learning_rate=1e-4))
     assert config_lib.options(faster) == ["--preset", "debug", "--ppo.learning-rate", "0.0001"]
+
+
+def test_a_contact_without_any_friction_is_refused():
+    """MJX divides by it in elliptic cones."""
+    with pytest.raises(ConfigError, match=r"randomize\.ground_friction"):
+        RandomizeConfig(friction=(0.0, 1.0), ground_friction=0.0)
+    assert RandomizeConfig(friction=(0.0, 1.0), ground_friction=0.1).friction[0] == 0.0

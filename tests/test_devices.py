@@ -21,12 +21,14 @@ import pytest
 from processes import DEBUG, TRAIN, alone, command, ended, free_port, rows, started
 from states import XBOT
 
-from kslc_jax import checkpoint_format, env, observations, physics, train, train_step
+from kslc_jax import checkpoint_format, env, observations, train, train_step
 from kslc_jax.config import ConfigError, preset
 from kslc_jax.training import checkpoint, devices
 
 STEPS = 3
-MJX = dataclasses.replace(preset("debug"), physics=physics.PhysicsConfig(engine="mjx"))
+MJX = dataclasses.replace(
+    preset("debug"), physics=dataclasses.replace(preset("debug").physics, engine="mjx")
+)
 
 
 # -------------------------------------------------------------------------------- in the processes

@@ -12,7 +12,7 @@ from packages import described
 from kslc_jax import doctor, robot
 from kslc_jax.checkup import findings, picture, report, statics, trials
 from kslc_jax.checkup.findings import Patient
-from kslc_jax.config import PhysicsConfig
+from kslc_jax.config import preset
 from kslc_jax.errors import UserError
 from kslc_jax.robots import description
 
@@ -278,7 +278,8 @@ def test_trials_have_the_physics_of_training(tmp_path):
 
 @pytest.mark.slow(reason="compiles MJX")
 def test_engines_agree_on_the_biped():
-    assert trials.engines_apart(PhysicsConfig(robot=BIPED)) < findings.AGREEMENT
+    config = dataclasses.replace(preset("laptop").physics, robot=BIPED)
+    assert trials.engines_apart(config) < findings.AGREEMENT
 
 
 # ---------------------------------------------------------------------------------------- command

@@ -42,7 +42,9 @@ SCALE = np.array(([0.25] * 4 + [0.85] * 2) * 2 + [0.25] * 4)
 RUNNER = Path(__file__).parents[1] / "examples" / "onnx_runner.py"
 V_MAX, CYCLE = 2.0, 0.55
 ROBOTS = 8
-STEPPED = PhysicsConfig(engine="mujoco", timestep=0.001, decimation=10)
+STEPPED = dataclasses.replace(
+    preset("debug").physics, engine="mujoco", timestep=0.001, decimation=10
+)
 """Physics of the runner: C MuJoCo with steps of 1 ms, as at high fidelity."""
 
 

@@ -320,10 +320,17 @@ def solver_error(config: PhysicsConfig) -> float:
 
 
 def test_few_iterations_go_far():
-    """The presets' iterations make a tenth of the error that the older ones made in pyramids."""
+    """The presets' iterations make less than a fifth of the error of the older ones in pyramids."""
     config = dataclasses.replace(preset("paper").physics, engine="mujoco")
     older = dataclasses.replace(config, cone="pyramidal", iterations=4, ls_iterations=5)
     assert solver_error(config) < 0.5 < 5 * 0.5 < solver_error(older)
+
+
+@pytest.mark.parametrize(("asked", "elliptic"), [(3, 3), (5, 5), (20, 5), (50, 12)])
+def test_mjx_searches_less_in_elliptic_cones(asked, elliptic):
+    for cone, found in (("elliptic", elliptic), ("pyramidal", asked)):
+        config = PhysicsConfig(engine="mjx", cone=cone, ls_iterations=asked)
+        assert physics._mjx_model(config).opt.ls_iterations == found
 
 
 @pytest.mark.parametrize("engine", QUICK_FIRST)

@@ -45,7 +45,17 @@ LIGHT = (
     "sim2sim",
     "play",
 )
-LIGHT += ("judge", "export", "compare", "reproduce", "doctor", "learning", "plots", "records")
+LIGHT += (
+    "judge",
+    "falls",
+    "export",
+    "compare",
+    "reproduce",
+    "doctor",
+    "learning",
+    "plots",
+    "records",
+)
 LIGHT += ("evaluation.tables", "evaluation.perturbations")
 """Modules that do not import JAX, so that a config check and `--help` are quick."""
 

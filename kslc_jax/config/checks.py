@@ -29,8 +29,8 @@ def require_seed(seed: int, name: str = "seed") -> None:
 
 
 LARGEST = 2**44
-"""Largest number of a config. The frames of a window become one axis of a network's input, so the
-product of two numbers must be a size of an array, below 2^63."""
+"""Numbers of a config lie below this one. The frames of a window become one axis of a network's
+input, and the size of an axis must be below 2^63: there is room for frames of 2^19 numbers."""
 
 
 def check_numbers(name: str, value: object) -> None:

@@ -241,6 +241,11 @@ class RandomizeConfig:
             "punch",
         ):
             require(getattr(self, name)[0] >= 0, f"randomize.{name} must not be negative")
+        require(
+            self.ground_friction >= 0 and self.friction[0] + self.ground_friction > 0,
+            "randomize.ground_friction must not be negative, and not 0 where friction may be 0: "
+            "mjx divides by the friction of a contact",
+        )
         require(self.link_mass[0] > 0, "randomize.link_mass must be positive")
         require(self.sole[1] <= MOST_INSET, f"randomize.sole must be at most {MOST_INSET} m")
         require(0 <= self.held_arms <= 1, "randomize.held_arms must lie in [0, 1]")

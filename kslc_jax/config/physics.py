@@ -81,11 +81,12 @@ class PhysicsConfig:
     """Newton iterations of the contact solver. With fewer than 4, joints of XBot-L without rotor
     inertia blow up (docs/fidelity_physics.md)."""
     ls_iterations: int = 5
-    """Line-search iterations of the contact solver. mjx takes a quarter, but at least 5."""
+    """Line-search iterations of the contact solver. In elliptic cones mjx takes a quarter of them,
+    but at least 5."""
     cone: Cone = "pyramidal"
-    """Shape of the friction cone. Friction in an elliptic cone is the same in all directions. A
-    pyramid inside it has down to 0.71 of this friction, so robots slip sooner
-    (docs/fidelity_physics.md). Elliptic cones need about 20 line-search iterations."""
+    """Shape of the friction cone. An elliptic cone has the same friction in all directions. A
+    pyramid has only 0.71 of it at 45 degrees, so robots slip sooner (docs/fidelity_physics.md).
+    Elliptic cones need about 20 line-search iterations."""
     threads: int = 0
     """CPU threads of the mujoco engine; 0: all CPUs that this process may use. Does not change
     results."""

@@ -1,4 +1,4 @@
-"""Which number of a robot decides if it falls: friction, payload, motors, ..., in numpy."""
+"""Which numbers of a robot go with its falls: friction, payload, motors, ..., in numpy."""
 
 import dataclasses
 from collections import Counter
@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from kslc_jax.randomize import Dynamics
+from kslc_jax.robot import Robot
 
 QUARTERS = 4
 
-ENOUGH = 3.0
-"""A number stands out if robots that fell differ in it from the others by so many standard errors.
-By chance alone, one number of 370 does."""
+ENOUGH = 16.3
+"""Least chi-square of a suspect. With three degrees of freedom, chance alone exceeds it once in a
+thousand. A report tests some 25 numbers, so one report of 40 names a number by chance."""
 
 FEWEST = 4
 """Least number of robots that fell, and of robots that did not, from which anything can be told."""
@@ -30,26 +31,29 @@ NAMES = {
     "link_com": "links' centres of mass [m]",
     "hand_mass": "mass at the hands [kg]",
     "sole": "smaller soles [m]",
-    "noise": "noise, factor",
 }
-"""Fields of `Dynamics`, in words."""
+"""Fields of `Dynamics`, in words. The trials have no noise."""
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A number in which robots that fell differ from those that did not."""
+    """A number of the robots that goes with their falls."""
 
     name: str
-    errors: float  # difference of the two means in standard errors; below 0: less of it falls
+    chi_square: float  # how much the quarters differ
     shares: tuple[float, ...]  # share that fell, of the quarter with the least of it to the most
 
 
-def numbers(dynamics: Dynamics) -> dict[str, np.ndarray]:
-    """The drawn numbers of N robots: name -> [N]. Of a number per joint or link, the mean counts;
-    of a position, each axis."""
+def numbers(dynamics: Dynamics, robot: Robot) -> dict[str, np.ndarray]:
+    """The drawn numbers of N robots that can matter: name -> [N]. Of a number per joint or link,
+    the mean counts; of a position, each axis."""
+    touching = robot.mj_model.geom_contype[robot.sole_geom_ids].any()
+    without = {"sole": not touching, "hand_mass": not len(robot.hand_body_ids)}
     found = {}
     for field, name in NAMES.items():
         values = np.asarray(getattr(dynamics, field))
+        if without.get(field):
+            continue
         if field.endswith("_com"):
             means = values.reshape(len(values), -1, 3).mean(1)
             found |= {f"{name}, {axis}": means[:, i] for i, axis in enumerate("xyz")}
@@ -58,42 +62,53 @@ def numbers(dynamics: Dynamics) -> dict[str, np.ndarray]:
     return {name: values for name, values in found.items() if np.ptp(values) > 0}
 
 
+def told(fell: np.ndarray) -> bool:
+    """True if enough robots fell, and enough did not, to tell anything. `fell` is [N] bool."""
+    return min(fell.sum(), (~fell).sum()) >= FEWEST
+
+
 def suspects(fell: np.ndarray, drawn: dict[str, np.ndarray]) -> list[Suspect]:
-    """The numbers that stand out, the clearest first. Empty if too few fell, or too few did not.
+    """The numbers whose quarters differ more than by chance, the clearest first.
 
     Args:
       fell: [N] bool.
       drawn: name -> [N], as of `numbers`.
     """
-    if min(fell.sum(), (~fell).sum()) < FEWEST:
+    if not told(fell):
         return []
-    spread = np.sqrt(1 / fell.sum() + 1 / (~fell).sum())
-    found = []
+    mean, found = fell.mean(), []
     for name, values in drawn.items():
-        errors = (values[fell].mean() - values[~fell].mean()) / (values.std() * spread)
-        if abs(errors) >= ENOUGH:
-            parts = np.array_split(fell[np.argsort(values, kind="stable")], QUARTERS)
-            shares = tuple(float(part.mean()) for part in parts)
-            found.append(Suspect(name, float(errors), shares))
-    return sorted(found, key=lambda suspect: -abs(suspect.errors))
+        parts = np.array_split(fell[np.argsort(values, kind="stable")], QUARTERS)
+        apart = (len(part) * (part.mean() - mean) ** 2 for part in parts)
+        chi_square = float(sum(apart) / (mean * (1.0 - mean)))
+        if chi_square >= ENOUGH:
+            found.append(Suspect(name, chi_square, tuple(float(part.mean()) for part in parts)))
+    return sorted(found, key=lambda suspect: -suspect.chi_square)
 
 
-def usual(falls: list[dict[str, Any]], shown: int = 3) -> list[tuple[str, int]]:
-    """The most frequent changes of the command before a fall, and how often each came.
+def kind(speed: float, top: float) -> str:
+    """Kind of a commanded forward speed [m/s]: stand, back, slow, or fast (above half of `top`)."""
+    if speed <= 0.0:
+        return "back" if speed < 0.0 else "stand"
+    return "fast" if speed > top / 2 else "slow"
 
-    A change is named by its forward speeds [m/s], rounded: "4 -> 0". `falls` as of `reaction`.
-    """
-    names = (" -> ".join(f"{round(fall[end][0]) + 0}" for end in ("from", "to")) for fall in falls)
+
+def usual(falls: list[dict[str, Any]], top: float, shown: int = 3) -> list[tuple[str, int]]:
+    """The most frequent changes of the command before a fall, such as "fast -> stand", and how
+    often each came. `falls` as of `reaction`, `top` [m/s] as of the schedule."""
+    names = (" -> ".join(kind(fall[end][0], top) for end in ("from", "to")) for fall in falls)
     return Counter(names).most_common(shown)
 
 
-def report(fell: np.ndarray, dynamics: Dynamics, falls: list[dict[str, Any]]) -> dict[str, Any]:
+def report(
+    fell: np.ndarray, drawn: dict[str, np.ndarray], falls: list[dict[str, Any]], top: float
+) -> dict[str, Any]:
     """Share that fell, the usual commands before, and the suspects, ready for JSON."""
-    found = suspects(fell, numbers(dynamics))
     return {
         "robots": len(fell),
         "fell": float(fell.mean()),
-        "commands": usual(falls),
-        "suspects": [dataclasses.asdict(suspect) for suspect in found],
+        "enough_to_tell": bool(told(fell)),
+        "commands": usual(falls, top),
+        "suspects": [dataclasses.asdict(suspect) for suspect in suspects(fell, drawn)],
         "falls": falls,
     }
