@@ -19,8 +19,6 @@ Examples:
   python -m kslc_jax.falls xbot_l_run --schedule jitter --top 3.5 --json falls.json
 """
 
-import dataclasses
-import functools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -34,16 +32,11 @@ from kslc_jax.config import ConfigError, Fidelity, require_seed
 from kslc_jax.evaluation import options, tables
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
     from kslc_jax.evaluation.schedules import Schedule
     from kslc_jax.evaluation.trials import Setting
     from kslc_jax.policy import Policy
 
 LEAST_ROBOTS = 16
-
-NEEDED = ("alive", "command", "leg")
-"""Fields of a trace that tell of falls."""
 
 
 @dataclass(frozen=True)
@@ -103,20 +96,15 @@ def measure(
     import numpy as np
 
     from kslc_jax import physics
-    from kslc_jax.evaluation import reaction, suspects, trials
+    from kslc_jax.evaluation import scheduled, suspects, trials
 
     assert setting.schedule
-    pieces = []
-    for piece in trials.run(policy, setting, np.zeros((robots, 3)), seed):
-        rest = (field.name for field in dataclasses.fields(piece) if field.name not in NEEDED)
-        pieces.append(piece.replace(**dict.fromkeys(rest)))
-        progress(len(pieces) / setting.seconds)
-    trace = trials.join(pieces)
-    falls = reaction.falls(trace, setting.physics.control_dt)
+    (row,) = scheduled.measure(policy, setting, [setting.schedule], robots, seed, progress)
+    fell = np.zeros(robots, bool)
+    fell[[fall["robot"] for fall in row["falls"]]] = True
     drawn = trials.drawn(policy, setting, robots, seed)
     can_matter = suspects.numbers(drawn, physics.robot_for(setting.physics))
-    fell = ~np.asarray(trace.alive)[-1]
-    return suspects.report(fell, can_matter, falls, setting.schedule.top)
+    return suspects.report(fell, can_matter, row["falls"], setting.schedule.top)
 
 
 def table(found: dict[str, dict[str, Any]], title: str):
@@ -164,7 +152,7 @@ def _report(args: Args) -> None:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in settings}
         for name, conditions in settings.items():
             bar.start_task(tasks[name])
-            told = functools.partial(_advance, bar, tasks[name])
+            told = lambda share, task=tasks[name]: bar.update(task, completed=share)  # noqa: E731
             found[name] = measure(policy, conditions, args.robots, args.seed, told)
     title = f"{args.policy}, train step {policy.step}, schedule {plan.name}"
     screen.print(table(found, f"{title} to {plan.top:g} m/s, {args.seconds:g} s"))
@@ -173,10 +161,6 @@ def _report(args: Args) -> None:
         about = {"policy": policy_name(args.policy), "step": policy.step, "robot": robot}
         asked = {"schedule": plan.name, "top": plan.top, "seconds": args.seconds}
         files.write_json(args.json, about | asked | {"seed": args.seed, "fidelities": found})
-
-
-def _advance(bar: "Progress", task: "TaskID", share: float) -> None:
-    bar.update(task, completed=share)
 
 
 if __name__ == "__main__":

@@ -203,7 +203,7 @@ def _blank_data(model: mujoco.MjModel) -> mjx.Data:
     address = mjx_rows.make_efc_address(model, of_jax.contact.dim, kinds)
     rows = {
         name: jnp.zeros((kinds.size, *getattr(of_jax, name).shape[1:]), of_jax.efc_D.dtype)
-        for name in ("efc_J", *(f"efc_{n}" for n in _ROW))
+        for name in _ROWS
     }
     contact = of_jax.contact.replace(efc_address=address)
     return data.replace(
@@ -211,8 +211,8 @@ def _blank_data(model: mujoco.MjModel) -> mjx.Data:
     )
 
 
-_ROW = ("pos", "margin", "frictionloss", "D", "aref", "force")
-"""What MJX's data have one number of for each row of the constraints."""
+_ROWS = ("efc_J", "efc_pos", "efc_margin", "efc_frictionloss", "efc_D", "efc_aref", "efc_force")
+"""Arrays of MJX's data with one row per row of the constraints."""
 
 
 def _own_device() -> jax.Device:

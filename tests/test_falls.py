@@ -169,8 +169,8 @@ def test_bad_input(changes, message, tmp_path):
 
 
 def test_a_short_trial(policy):
-    """Of robots on ice, told to run from rest, some fall within three seconds. No number but the
-    ones that are drawn is named."""
+    """More than half of the robots on ice fall within three seconds. Their friction is not named,
+    because it is the same for all."""
     args = falls.Args(policy=Path("xbot_l_run"), robots=16, seconds=3.0)
     schedule = schedules.named("random", policy.config, 4.0)
     conditions = falls.setting(policy, args, schedule, "train")
