@@ -41,12 +41,14 @@ lint: $(STAMP) ## ruff and ty
 # The commands stand in these pages, each beside what it makes.
 RESULTS := docs/results.md docs/lab_notebook.md
 
-figures: $(STAMP) ## The figures of docs/results.md again, from the data beside them: a minute
+figures: $(STAMP) ## The figures and tables of the pages again, from the data beside them: a minute
 	@grep -h '^python -m kslc_jax.plots' $(RESULTS) | PATH="$(BIN):$$PATH" sh -ex
+	@$(BIN)/python -m docs.tables
 
 results: $(STAMP) ## Those data too, from the shipped policy, its gait strips and its film: half an hour
 	@$(PIP) -e '.[drake]'
-	@grep -hE '^python -m kslc_jax.(evaluate|sim2sim|play|plots)' $(RESULTS) | PATH="$(BIN):$$PATH" sh -ex
+	@grep -hE '^python -m kslc_jax.(evaluate|sim2sim|judge|play|plots)' $(RESULTS) | PATH="$(BIN):$$PATH" sh -ex
+	@$(BIN)/python -m docs.tables
 
 bench: $(STAMP) ## Throughput of a whole training step
 	@$(BIN)/python -m benchmarks.throughput --repeats 3 $(ARGS)

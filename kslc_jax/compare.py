@@ -23,6 +23,7 @@ from types import FrameType
 
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from kslc_jax import cli, evaluate, files, records, train
@@ -224,17 +225,15 @@ def keep(run: Path, folder: Path) -> None:
         files.write_atomically(folder / name, (run / name).read_text())
     learnt = json.loads((run / files.LEARNING).read_text())
     for point in learnt["points"]:
-        point["rows"] = [{n: _short(row[n]) for n in records.LEARNT} for row in point["rows"]]
+        point["rows"] = [
+            {n: records.short(row[n]) for n in records.LEARNT} for row in point["rows"]
+        ]
     files.write_atomically(folder / files.LEARNING, json.dumps(learnt))
     metrics = records.read_metrics(run)
     count = len(metrics["env_steps"])
     kept = sorted({*range(0, count, 10), *records.growth(metrics), count - 1})
-    rows = ({name: _short(metrics[name][i]) for name in records.COLUMNS} for i in kept)
+    rows = ({name: records.short(metrics[name][i]) for name in records.COLUMNS} for i in kept)
     files.write_atomically(folder / files.METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
-
-
-def _short(x: float) -> float:
-    return int(x) if x == int(x) else float(f"{x:.5g}")
 
 
 def table(runs: Sequence[Path]) -> Table:
@@ -244,13 +243,13 @@ def table(runs: Sequence[Path]) -> Table:
     """
     shown = Table(box=box.MARKDOWN)
     for header in ("run", "steps", "v_max [m/s]", "after"):
-        shown.add_column(header, no_wrap=True)
+        shown.add_column(escape(header), no_wrap=True)  # rich would read [m/s] as a style
     results = {run: _speeds(run) for run in runs}
     commands = sorted({command for speeds in results.values() for command in speeds})
     for command in commands:
         shown.add_column(tables.speed(command), justify="right")
     for run, speeds in results.items():
-        shown.add_row(run.name, *_reached(run), *(speeds.get(v, "-") for v in commands))
+        shown.add_row(escape(run.name), *_reached(run), *(speeds.get(v, "-") for v in commands))
     return shown
 
 
@@ -278,7 +277,7 @@ def report(args: Args, refused: Sequence[str]) -> None:
     done = [run for run in finished(args.out) if run.name not in refused]
     if done:
         print("mean forward speed [m/s] per command:")
-        Console(highlight=False, markup=False, width=WIDTH).print(table(done))
+        Console(highlight=False, width=WIDTH).print(table(done))
     if args.keep:
         for run_dir in done:
             keep(run_dir, args.keep / run_dir.name)

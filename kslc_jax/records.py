@@ -51,6 +51,11 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
     return [(v[i], records["env_steps"][i], records["seconds"][i]) for i in growth(records)]
 
 
+def short(x: float) -> float:
+    """A value for a file that is kept: a whole number as it is, others with five digits."""
+    return int(x) if float(x).is_integer() else float(f"{x:.5g}")
+
+
 def in_minutes(seconds: float) -> str:
     """A time [s] as '34 min'; below ten minutes with a decimal, as '1.5 min'."""
     minutes = seconds / 60.0

@@ -125,7 +125,7 @@ def execute(name: str, folder: Path, monkeypatch) -> None:
 def test_quick_recipes(name, tmp_path, monkeypatch, capsys):
     run = tmp_path / "runs" / "laptop-seed0"
     run.mkdir(parents=True)
-    shutil.copy(ROOT / "docs" / "training" / "laptop-seed0.jsonl", run / "metrics.jsonl")
+    shutil.copy(ROOT / "docs" / "training" / "xbot_l_run.jsonl", run / "metrics.jsonl")
     execute(name, tmp_path, monkeypatch)
     said = capsys.readouterr().out
     if name == QUICK[0]:

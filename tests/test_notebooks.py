@@ -116,7 +116,7 @@ def test_rewards_and_curriculum(execute):
         value = math.exp(-5.0 * v**2)
         line = f"commanded {v:.1f} m/s: reward {value:.1e}, slope {10.0 * v * value:.1e}"
         assert line in text(notebook)
-    stored = records.read_metrics(ROOT / "docs" / "training" / "laptop-seed0.jsonl")
+    stored = records.read_metrics(ROOT / "docs" / "training" / "xbot_l_run.jsonl")
     assert len(re.findall("^v_max .* m/s from", text(notebook), re.M)) == len(
         records.milestones(stored)
     )
