@@ -210,7 +210,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "command.stand_fraction": 0.15,
         "command.top_fraction": 0.15,
         "command.brake_fraction": 0.3,
-        "command.acceleration": 3.0,
+        "command.acceleration": 2.0,
         "command.forward_fraction": 0.2,
         "command.slow_fraction": 0.15,
         "command.narrow_speed": 4.0,

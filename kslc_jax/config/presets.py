@@ -59,7 +59,7 @@ _LAPTOP = _override(
     ppo={"entropy_fades": True, "average": 0.98, "value_per_command": True},
     command={
         "shortest_seconds": 1.0,
-        "acceleration": 3.0,
+        "acceleration": 2.0,
         "stand_fraction": 0.15,
         "forward_fraction": 0.2,
         "slow_fraction": 0.15,
