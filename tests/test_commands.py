@@ -242,7 +242,7 @@ def test_no_robot_can_choose_whether_its_command_is_to_stand():
     """4000 drawn commands of the recipe, the same for robots that turn wildly and for robots that
     go straight: who is to step, and when, is the same. Only turns on the spot end with the turn.
     """
-    config, steps = preset("laptop").command, 150
+    config, steps = preset("laptop").command, 200
     assert steps * DT * config.acceleration > 3.5  # enough for a stop from the running speed
     at = jax.jit(jax.vmap(lambda c, yaw: commands.steer(config, c, yaw, DT), (0, None)))
     running = make_command(velocity=[3.5, 0.0, 0.0])
