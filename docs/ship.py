@@ -9,7 +9,6 @@ The median of the trained seeds ships, not the best: python -m kslc_jax.judge na
 """
 
 import argparse
-import json
 import shutil
 import sys
 import tempfile
@@ -44,11 +43,8 @@ def put_policy(run: Path, folder: Path) -> None:
 def put_training(run: Path, stem: Path) -> None:
     """Writes the thinned metrics, the versions and the curve of a run beside `stem`."""
     metrics = records.read_metrics(run)
-    count = len(metrics["env_steps"])
-    kept = sorted({*range(0, count, EVERY), *records.growth(metrics), count - 1})
-    rows = ({name: records.short(column[i]) for name, column in metrics.items()} for i in kept)
     out = stem.with_suffix(".jsonl")
-    out.write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    out.write_text(records.thinned(metrics, EVERY, metrics))
     shutil.copy(run / files.VERSIONS, stem.with_suffix(".versions.json"))
     plots.main(["training", str(out), "--out", str(stem.with_suffix(".png"))])
 

@@ -229,11 +229,8 @@ def keep(run: Path, folder: Path) -> None:
             {n: records.short(row[n]) for n in records.LEARNT} for row in point["rows"]
         ]
     files.write_atomically(folder / files.LEARNING, json.dumps(learnt))
-    metrics = records.read_metrics(run)
-    count = len(metrics["env_steps"])
-    kept = sorted({*range(0, count, 10), *records.growth(metrics), count - 1})
-    rows = ({name: records.short(metrics[name][i]) for name in records.COLUMNS} for i in kept)
-    files.write_atomically(folder / files.METRICS, "".join(f"{json.dumps(row)}\n" for row in rows))
+    thinned = records.thinned(records.read_metrics(run), 10, records.COLUMNS)
+    files.write_atomically(folder / files.METRICS, thinned)
 
 
 def table(runs: Sequence[Path]) -> Table:

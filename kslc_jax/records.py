@@ -1,7 +1,7 @@
 """Reads the files that trainings and evaluations have written. Imports no JAX and no matplotlib."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,6 +54,17 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
 def short(x: float) -> float:
     """A value for a file that is kept: a whole number as it is, others with five digits."""
     return int(x) if float(x).is_integer() else float(f"{x:.5g}")
+
+
+def thinned(records: Records, every: int, names: Iterable[str]) -> str:
+    """Lines of a metrics.jsonl that is kept: the columns `names` of every `every`-th record.
+
+    The records at which the range of commands grew, and the last one, are kept as well.
+    """
+    count = len(records["env_steps"])
+    kept = sorted({*range(0, count, every), *growth(records), count - 1})
+    rows = ({name: short(records[name][i]) for name in names} for i in kept)
+    return "".join(f"{json.dumps(row)}\n" for row in rows)
 
 
 def in_minutes(seconds: float) -> str:
