@@ -264,7 +264,7 @@ def test_laptop_departs_from_the_paper_in_these_numbers_only():
         "rewards.weights.base_height": 0.5,
         "rewards.weights.tracking_lin_vel": 2.0,
         "rewards.weights.track_vel_hard": 0.8,
-        "rewards.weights.tracking_mean_vel": 2.0,
+        "rewards.weights.tracking_mean_vel": 4.0,
         "rewards.weights.dof_acc": -3e-7,
         "rewards.weights.dof_vel_limits": -10.0,
         "rewards.weights.stand_still": -1.0,

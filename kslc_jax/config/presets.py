@@ -125,7 +125,7 @@ _LAPTOP = _override(
             "base_height": 0.5,
             "tracking_lin_vel": 2.0,
             "track_vel_hard": 0.8,
-            "tracking_mean_vel": 2.0,
+            "tracking_mean_vel": 4.0,
             "tracking_ang_vel": 1.5,
             "dof_acc": -3e-7,
             "dof_vel_limits": -10.0,
