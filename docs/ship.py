@@ -16,6 +16,7 @@ from pathlib import Path
 
 from kslc_jax import export, files, plots, records
 from kslc_jax.policy import POLICIES
+from kslc_jax.records import Records
 
 TRAINING = Path(__file__).parent / "training"
 
@@ -25,24 +26,21 @@ EVERY = 3
 CARD = "CARD.md"
 
 
-def put_policy(run: Path, folder: Path) -> None:
+def put_policy(run: Path, metrics: Records, folder: Path) -> None:
     """Replaces the policy in `folder` by the newest one of the run. The card stays."""
     with tempfile.TemporaryDirectory() as temporary:
         new = Path(temporary) / folder.name
         if export.main([str(run), str(new), "--format", "orbax"]):
             raise SystemExit(1)
-        reached = records.milestones(records.read_metrics(run))
-        steps = {f"{speed:g}": after for speed, after, _ in reached}
-        files.write_json(new / files.MILESTONES, steps)
+        files.write_json(new / files.MILESTONES, records.milestone_steps(metrics))
         if (folder / CARD).exists():
             shutil.copy(folder / CARD, new)
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(new, folder)
 
 
-def put_training(run: Path, stem: Path) -> None:
+def put_training(run: Path, metrics: Records, stem: Path) -> None:
     """Writes the thinned metrics, the versions and the curve of a run beside `stem`."""
-    metrics = records.read_metrics(run)
     out = stem.with_suffix(".jsonl")
     out.write_text(records.thinned(metrics, EVERY, metrics))
     shutil.copy(run / files.VERSIONS, stem.with_suffix(".versions.json"))
@@ -55,8 +53,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("run", type=Path, help="run folder of a finished training")
     parser.add_argument("name", help="name of the policy, as xbot_l_run")
     args = parser.parse_args(argv)
-    put_policy(args.run, POLICIES / args.name)
-    put_training(args.run, TRAINING / args.name)
+    try:
+        metrics = records.read_metrics(args.run)
+    except ValueError as error:
+        parser.error(str(error))
+    put_policy(args.run, metrics, POLICIES / args.name)
+    put_training(args.run, metrics, TRAINING / args.name)
     print(f"{args.name} is in the package; next: make results")
     return 0
 

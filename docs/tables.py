@@ -61,7 +61,12 @@ SIDEWAYS = tuple(
 
 OLDER = "of an older recipe: `make train` trains another policy today"
 
-LEARNT_TO_WALK = "episodes of 2000 of 2400 steps, tracking above 0.8 of its maximum"
+WALKS_STEPS, WALKS_TRACKING = 2000, 0.8
+"""A robot that walks has longer episodes [control steps] and more tracking [share] than these."""
+
+LEARNT_TO_WALK = (
+    f"episodes of {WALKS_STEPS} of 2400 steps, tracking above {WALKS_TRACKING:g} of its maximum"
+)
 
 
 def bars(path: Path) -> Table:
@@ -77,24 +82,23 @@ def seeds(*paths: Path) -> Table:
 def speeds(path: Path) -> Table:
     """Constant commands: one row each."""
     stored = read(path)
-    rows = stored["speeds"] if "speeds" in stored else _only(stored["conditions"])
-    return tables.table(rows, "", GAIT)
+    return tables.table(stored["speeds"] if "speeds" in stored else _only(path), "", GAIT)
 
 
 def sideways(path: Path) -> Table:
     """Constant commands with a turn or a side step."""
-    return tables.table(_only(read(path)["conditions"]), "", SIDEWAYS)
+    return tables.table(_only(path), "", SIDEWAYS)
 
 
 def schedules(path: Path) -> Table:
     """Commands that change."""
-    return scheduled.table(read(path)["conditions"], "")
+    return scheduled.table(records.read_conditions(path), "")
 
 
 def conditions(path: Path) -> Table:
     """Share of the robots that do not fall, and mean vx, by condition and commanded speed."""
     stored = read(path)
-    found = stored["perturbed"] if "perturbed" in stored else stored["conditions"]
+    found = stored["perturbed"] if "perturbed" in stored else records.read_conditions(path)
     return _by_speed("survived, mean vx [m/s]", found)
 
 
@@ -113,7 +117,8 @@ def comparison(folder: Path) -> Table:
 def milestones(path: Path) -> Table:
     """When a training reached what, by its metrics."""
     metrics = records.read_metrics(path)
-    walks = (metrics["episode_steps"] > 2000) & (metrics["curriculum/tracking"] > 0.8)
+    long = metrics["episode_steps"] > WALKS_STEPS
+    walks = long & (metrics["curriculum/tracking"] > WALKS_TRACKING)
     found = [(LEARNT_TO_WALK, int(walks.argmax()))] if walks.any() else []
     for i in records.growth(metrics):
         found.append((f"commands up to {metrics['curriculum/v_max'][i]:.1f} m/s", int(i)))
@@ -137,7 +142,7 @@ def card(policy: Path, training: Path) -> Table:
     robot = "" if name == XBOT_L else f" --robot {name}"
     older = reproduce.of_an_older_recipe(loaded.config)
     length = f"{loaded.step} train steps, {metrics['env_steps'][-1] / 1e6:.1f} M environment steps"
-    out = Table("what", "")
+    out = Table("what", "this policy")
     out.add_row("trained by", f"`python -m kslc_jax.train{robot} --seed {loaded.config.seed}`")
     out.add_row("commit", commit)
     out.add_row("recipe", OLDER if older else "that of `make train` today")
@@ -169,9 +174,9 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def _only(found: dict[str, list[Row]]) -> list[Row]:
-    """The rows of the only condition."""
-    (rows,) = found.values()
+def _only(path: Path) -> list[Row]:
+    """The rows of the only condition of a file of sim2sim --json."""
+    (rows,) = records.read_conditions(path).values()
     return rows
 
 

@@ -51,6 +51,11 @@ def milestones(records: Records) -> list[tuple[float, float, float]]:
     return [(v[i], records["env_steps"][i], records["seconds"][i]) for i in growth(records)]
 
 
+def milestone_steps(records: Records) -> dict[str, float]:
+    """Environment steps until the commands reached each speed, by the speed [m/s] as text."""
+    return {f"{speed:g}": steps for speed, steps, _ in milestones(records)}
+
+
 def short(x: float) -> float:
     """A value for a file that is kept: a whole number as it is, others with five digits."""
     return int(x) if float(x).is_integer() else float(f"{x:.5g}")

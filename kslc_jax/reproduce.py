@@ -127,8 +127,7 @@ def retrain(args: Args, config: Config, until: float) -> dict[str, float]:
     state = loop.train(config, args.run_dir, going_on, progress)
     if int(state.step) < config.num_updates:
         raise Stopped("stopped; the same command tries the policy again and goes on training")
-    metrics = records.read_metrics(args.run_dir)
-    return {f"{speed:g}": steps for speed, steps, _ in records.milestones(metrics)}
+    return records.milestone_steps(records.read_metrics(args.run_dir))
 
 
 def report(rows: list[Row], title: str) -> Table:
