@@ -51,7 +51,7 @@ class Args:
     seconds: float | None = None
     """Length of the trials at constant speeds [s]; None: 60, with --quick 15."""
     harsh: bool = False
-    """Also try the policy under punches of 300 N and of 500 N (reported, no bar), with arms that
+    """Also try the policy under punches of 300 N and of 500 N (only reported), with arms that
     follow random targets, and on uneven ground: 18 times 32 trials of 30 s."""
     drake: bool = False
     """Also try the policy in Drake. This is slow, and needs the package drake."""
@@ -96,9 +96,8 @@ def table(found: list[Bar], title: str):
     for label in ("bar", "wanted", "worst", "where", "met"):
         out.add_column(label)
     for bar in found:
-        out.add_row(
-            escape(bar.name), bar.wanted, bar.shown(), bar.where, "yes" if bar.met else "NO"
-        )
+        met = ("yes" if bar.met else "NO") if bar.requires else "-"
+        out.add_row(escape(bar.name), bar.wanted, bar.shown(), bar.where, met)
     return out
 
 
@@ -137,8 +136,8 @@ def side_by_side(kept: dict[str, Results]):
     judged: dict[str, list[Bar]] = {name: one["bars"] for name, one in kept.items()}
     names = ranked(judged)
     median = names[len(names) // 2]
-    missed = sum(not bar.met for bar in judged[median])
-    caption = f"median: {median}, which misses {missed} of {len(judged[median])} bars. *: missed"
+    met = [bar.met for bar in judged[median] if bar.requires]
+    caption = f"median: {median}, which misses {met.count(False)} of {len(met)} bars. *: missed"
     if differ := _unlike(list(kept.values())):
         caption += f"\nNot comparable: the files differ in {', '.join(differ)}."
     out = Table("bar", "wanted", *map(escape, names), caption=caption, caption_justify="left")

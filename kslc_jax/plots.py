@@ -93,7 +93,7 @@ def learning(methods: dict[str, list[Curve]], out: Path) -> None:
         axis.grid(alpha=0.3)
     figure.supxlabel("environment steps [millions]", fontsize=10)
     figure.supylabel("mean forward speed [m/s]", fontsize=10)
-    _legend(figure, axes[0])
+    _legend(figure)
     _save(figure, out)
 
 
@@ -111,11 +111,16 @@ def _panels(count: int, **style):
     return figure, list(axes.flat[:count])
 
 
-def _legend(figure, axis) -> None:
-    """Draws one legend above all panels, with the lines of the panel `axis`."""
-    handles, labels = axis.get_legend_handles_labels()
-    columns = min(len(labels), 8)
-    figure.legend(handles, labels, loc="outside upper center", ncols=columns, fontsize=8)
+def _legend(figure) -> None:
+    """Draws one legend above all panels. A label that several panels have appears once."""
+    found = {}
+    for axis in figure.axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            found.setdefault(label, handle)
+    columns = min(len(found), 8)
+    figure.legend(
+        list(found.values()), list(found), loc="outside upper center", ncols=columns, fontsize=8
+    )
 
 
 def _over_commands(axis, label: str, color: str, seeds: list[list[dict]], name: str, **style):
@@ -145,7 +150,7 @@ def performance(methods: dict[str, list[list[dict]]], out: Path) -> None:
         axis.grid(alpha=0.3)
     top = max(row["command"] for seeds in methods.values() for row in seeds[0])
     axes[0, 0].plot([0, top], [0, top], "k:", linewidth=1, label="commanded")
-    _legend(figure, axes[0, 0])
+    _legend(figure)
     for axis in axes[1]:
         axis.set_xlabel("commanded speed [m/s]")
     _save(figure, out)
@@ -162,7 +167,7 @@ def momentum(methods: dict[str, list[list[dict]]], out: Path) -> None:
     axes[0].set_ylim(bottom=0)
     figure.supxlabel("commanded speed [m/s]", fontsize=10)
     figure.supylabel("yaw angular momentum, rms [kg m²/s]", fontsize=10)
-    _legend(figure, axes[0])
+    _legend(figure)
     _save(figure, out)
 
 
@@ -184,7 +189,7 @@ def schedules(rows: list[dict], out: Path) -> None:
             axis.grid(alpha=0.3)
     figure.supxlabel("time [s]", fontsize=10)
     figure.supylabel("forward speed [m/s]", fontsize=10)
-    _legend(figure, axes[0, 0])
+    _legend(figure)
     _save(figure, out)
 
 
@@ -269,6 +274,8 @@ class Schedules:
 
     results: tyro.conf.Positional[Path]
     """JSON file of sim2sim --schedule."""
+    condition: str = "nominal"
+    """The perturbation, ground or heading to draw."""
     out: Path = Path("schedules.png")
     """File of the figure."""
 
@@ -295,7 +302,7 @@ def draw(args: Drawing) -> None:
     """
     files.require_suffix(args.out, files.FIGURES)
     if isinstance(args, Schedules):
-        return schedules(records.read_schedules(args.results), args.out)
+        return schedules(records.read_schedules(args.results, args.condition), args.out)
     if isinstance(args, Conditions):
         return conditions(records.read_conditions(args.results), args.out)
     if not (args.runs if isinstance(args, Training | Learning) else args.evaluations):

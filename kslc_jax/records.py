@@ -153,12 +153,16 @@ def _aligned(name: str, curves: list[Curve]) -> list[Curve]:
     return cut
 
 
-def read_schedules(path: Path) -> list[dict]:
-    """Nominal rows of a file of sim2sim --schedule --json; ValueError if it is no such file."""
+def read_schedules(path: Path, condition: str) -> list[dict]:
+    """Rows of one condition in a file of sim2sim --schedule --json; ValueError if there are
+    none."""
+    conditions = read_conditions(path)
+    if condition not in conditions:
+        raise ValueError(f"{path} has no condition {condition!r}, but {', '.join(conditions)}")
+    rows = conditions[condition]
     try:
-        rows = json.loads(path.read_text())["conditions"]["nominal"]
         _ = [row["series"]["forward"][0][0] for row in rows]
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
+    except (KeyError, TypeError, IndexError) as error:
         raise ValueError(f"{path} holds no schedules (of sim2sim --schedule --json)") from error
     return rows
 

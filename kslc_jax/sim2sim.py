@@ -221,7 +221,8 @@ def _rows(
 
 def summary(results: Results, title: str) -> Table:
     """Survival and mean speed of every condition and commanded speed."""
-    out = Table(title=title, title_justify="left")
+    caption = tables.caption(row for rows in results.values() for row in rows)
+    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     out.add_column(escape("survived, mean vx [m/s]"))
     for row in results["nominal"]:
         out.add_column(tables.speed(row["command"]), justify="right")

@@ -115,6 +115,17 @@ def test_harsh_conditions_are_bars_where_they_were_tried():
     assert missed.where == "1 m/s"
 
 
+def test_a_share_of_0_is_only_reported():
+    parts = {"punch=500": {"wanted": 0.0, "rows": [row(0.0), row(1.0, survival=0.25)]}}
+    results = bars(good() | {"harsh": parts})
+    (found,) = [bar for bar in results if not bar.requires]
+    assert (found.value, found.where, found.met) == (0.25, "1 m/s", True)
+    shown = list(judge.table(results, "").columns[4].cells)
+    assert shown == ["yes"] * 13 + ["-"]
+    side = judge.side_by_side({"a": {"bars": results}})
+    assert "misses 0 of 13 bars" in str(side.caption)
+
+
 def test_harsh_conditions_are_tried_as_named(monkeypatch):
     seen = []
 

@@ -153,6 +153,40 @@ def test_every_condition_is_a_row_of_a_figure(tmp_path, monkeypatch):
     assert labels == [["stop"], ["nominal"]] and texts == ["75%"]
 
 
+def reactions(*forward):
+    """A row of sim2sim --schedule: the speeds of its robots, at a command of 1 m/s."""
+    commanded = [[1.0 if x is not None else None for x in robot] for robot in forward]
+    series = {"every": 0.1, "commanded": commanded, "forward": forward}
+    return {"schedule": "stop", "survival": 0.5, "series": series}
+
+
+def test_the_speeds_of_a_condition_are_drawn_over_time(tmp_path, monkeypatch):
+    """The second robot falls after 0.2 s. The legend says so, though the first panel shows none."""
+    figures = []
+    monkeypatch.setattr(plots, "_save", lambda figure, out: figures.append(figure))
+    path = tmp_path / "x.json"
+    rows = [reactions([0.0, 0.5, 1.0], [0.0, 0.5, None])]
+    path.write_text(json.dumps({"conditions": {"nominal": rows[:1], "punch=500": rows}}))
+    assert plots.main(["schedules", str(path), "--condition", "punch=500"]) == 0
+    (drawn,) = figures
+    first, second = drawn.axes
+    assert first.get_title() == "stop: 50% survived"
+    np.testing.assert_allclose(first.lines[1].get_xydata(), [[0.0, 0.0], [0.1, 0.5], [0.2, 1.0]])
+    assert second.lines[2].get_xdata()[0] == pytest.approx(0.2)
+    labels = [text.get_text() for text in drawn.legends[0].get_texts()]
+    assert labels == ["commanded", "actual", "fell"]
+
+
+def test_no_schedules(tmp_path, capsys):
+    path = tmp_path / "x.json"
+    rows = [{"command": 1.0, "survival": 1.0}]
+    path.write_text(json.dumps({"conditions": {"nominal": rows, "payload=5": rows}}))
+    assert plots.main(["schedules", str(path)]) == 2
+    assert "holds no schedules" in capsys.readouterr().err
+    assert plots.main(["schedules", str(path), "--condition", "com=1"]) == 2
+    assert "has no condition 'com=1', but nominal, payload=5" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("content", ["[]", "{}", '{"conditions": {}}', '{"conditions": {"a": []}}'])
 def test_no_conditions(content, tmp_path, capsys):
     (tmp_path / "x.json").write_text(content)

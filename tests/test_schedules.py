@@ -11,7 +11,7 @@ from states import still_policy
 
 from kslc_jax import curriculum
 from kslc_jax.config import ConfigError, HighFidelity, PhysicsConfig, preset
-from kslc_jax.evaluation import reaction, schedules, trained, trials
+from kslc_jax.evaluation import reaction, scheduled, schedules, tables, trained, trials
 from kslc_jax.evaluation.perturbations import Variation
 from kslc_jax.policy import Policy
 
@@ -118,10 +118,14 @@ def test_a_file_of_ones_own(tmp_path):
         ("[", "is not JSON"),
         ("{}", "is no list of steps"),
         ("[]", "is no list of steps"),
-        ('[{"vx": 1}]', "step 0 .* needs numbers for seconds and vx"),
-        ('[{"seconds": 1, "vx": 1, "speed": 2}]', "step 0 .* needs numbers"),
-        ('[{"seconds": 1, "vx": 1}, {"seconds": 0, "vx": 1}]', "step 1 .* seconds above 0"),
-        ('[{"seconds": 1, "vx": NaN}]', "finite"),
+        ("[1]", "step 0 .* needs seconds and vx"),
+        ('[{"vx": 1}]', "step 0 .* needs seconds and vx"),
+        ('[{"seconds": 1, "vx": 1, "speed": 2}]', "step 0 .* unknown name 'speed'"),
+        ('[{"seconds": 1, "vx": 1}, {"seconds": 0, "vx": 1}]', "step 1 .* seconds must be above 0"),
+        ('[{"seconds": 1, "vx": NaN}]', "vx must be a finite number"),
+        ('[{"seconds": 1, "vx": "fast"}]', "vx must be a finite number"),
+        ('[{"seconds": 1, "vx": 1, "heading": null}]', "heading must be a finite number"),
+        ('[{"seconds": 1, "vx": 1' + 400 * "0" + "}]", "vx must be a finite number"),
         ('[{"seconds": 1, "vx": 1, "yaw_rate": 1, "heading": 0}]', "both"),
     ],
 )
@@ -131,6 +135,11 @@ def test_a_file_that_is_no_schedule_is_told_in_one_line(tmp_path, text, says):
     with pytest.raises(ConfigError, match=says) as error:
         schedules.named(str(path), CONFIG, 4.0)
     assert "\n" not in str(error.value)
+
+
+def test_a_folder_is_no_schedule(tmp_path):
+    with pytest.raises(ConfigError, match=r"cannot read .*: Is a directory"):
+        schedules.named(str(tmp_path), CONFIG, 4.0)
 
 
 def test_an_unknown_name_lists_the_known_ones():
@@ -219,6 +228,45 @@ def test_the_leg_of_a_fall_is_no_change(lived, changes):
     trace = synthetic(1.0 * leg, 1.0 * leg, leg, np.arange(900) < lived)
     found = reaction.summary(trace, DT)
     assert found["changes"] == changes and ("settled" in found) == bool(changes)
+
+
+def test_a_tour_counts_its_way_points():
+    """Two are reached in 10 s each. The third is given up. The fourth leg has not ended."""
+    leg = np.repeat([0, 1, 2, 3], [1000, 1000, round(schedules.PATIENCE / DT), 1000])
+    speed = np.ones(len(leg))
+    found = reaction.tour(synthetic(speed, speed, leg), DT)
+    assert found["way_points"] == pytest.approx(2 / 1.5) and found["given_up"] == 1.0
+    assert found["survival"] == 1.0 and found["forward_mean"] == pytest.approx(1.0)
+    fallen = reaction.tour(synthetic(speed, speed, leg, np.arange(len(leg)) < 1500), DT)
+    assert fallen["way_points"] == pytest.approx(1 / 0.25) and fallen["given_up"] == 0.0
+    assert fallen["seconds_to_fall"] == pytest.approx(15.0)
+
+
+def test_each_schedule_is_a_row_with_its_own_metrics(still, monkeypatch):
+    """Of a stand-in for the trials: a fall after 15 s, and a robot that does as it is told."""
+    leg = np.repeat([0, 1], [1000, 1000])
+
+    def run(policy, setting, commanded, seed):
+        tour = setting.schedule.tour
+        yield synthetic(1.0 * leg, 1.0 * leg, leg, np.arange(2000) < (1500 if tour else 2000))
+
+    monkeypatch.setattr(trials, "run", run)
+    setting = trials.Setting(PhysicsConfig(engine="mujoco"), seconds=20.0)
+    plans = [schedules.named(name, preset("debug"), 1.0) for name in ("stop", "tour")]
+    told = []
+    stop, tour = scheduled.measure(still, setting, plans, 1, progress=told.append)
+    assert told == pytest.approx([0.025, 0.525])  # one second of 20, of each of two
+    assert stop["schedule"] == "stop" and stop["top"] == 1.0 and stop["changes"] == 1
+    assert stop["falls"] == [] and len(stop["series"]["forward"][0]) == 200
+    assert tour["way_points"] == pytest.approx(4.0) and "changes" not in tour
+    assert [fall["seconds"] for fall in tour["falls"]] == [15.0]
+
+    shown = scheduled.table({"nominal": [stop, tour]}, "title")
+    columns = {str(column.header): list(column.cells) for column in shown.columns}
+    assert columns["schedule"] == ["stop*", "tour*"] and shown.caption == tables.BEYOND
+    assert columns["survived"] == ["100%", "0%"] and columns["fell at \\[s]"] == ["-", "15"]
+    assert columns["changes"] == ["1.0", "-"] and columns["way-points a minute"] == ["-", "4.0"]
+    assert "within \\[m]" not in columns  # neither has stops
 
 
 # ----------------------------------------------------------------------------------------- trained

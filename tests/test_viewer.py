@@ -1,5 +1,6 @@
 """The live viewer: session, pacer, figure, panel, page. Also `play`: films and errors."""
 
+import copy
 import dataclasses
 import io
 import os
@@ -21,9 +22,10 @@ from states import still_policy
 
 import kslc_jax.viewer
 from kslc_jax import config, files, play, robot
+from kslc_jax import ground as ground_lib
 from kslc_jax import policy as policy_lib
 from kslc_jax.config import ConfigError, PhysicsConfig, preset
-from kslc_jax.evaluation import schedules, trials
+from kslc_jax.evaluation import perturbations, schedules, trials
 from kslc_jax.viewer import films, following, session
 
 C_MUJOCO = PhysicsConfig(engine="mujoco")
@@ -601,6 +603,24 @@ def test_a_strip_that_fails_leaves_the_models_camera_as_it_was(monkeypatch, xbot
     with pytest.raises(render.RenderError):
         render.gait_strip(xbot, np.tile(xbot.default_qpos, (10, 1)), dt=0.1)
     assert camera.fovy == before != render.LONG_LENS
+
+
+def test_a_strip_shows_each_window_of_the_ground_once():
+    """On a slope of 10 degrees: 7 m away and 16 m away the ground is another window, higher."""
+    from kslc_jax.viewer import render
+
+    terrain = perturbations.terrain("slope:10")
+    robot_on_slope = robot.load("high", terrain=terrain)
+    ground, model = ground_lib.largest(terrain), copy.copy(robot_on_slope.mj_model)
+    (floor,) = robot_on_slope.ground_geom_ids
+    known: set = set()
+    places = [np.array([x, 0.0, 1.0]) for x in (0.0, 2.0, 7.0, 9.0, 16.0)]
+    new = [render._put_window(robot_on_slope, model, ground, place, known) for place in places]
+    assert new == [True, False, True, False, False]
+    rise = 12.0 * np.tan(np.radians(10.0))
+    np.testing.assert_allclose(model.geom_pos[floor][:2], [12.0, 0.0], atol=1e-6)
+    heights = sorted(place[2] for place in known)
+    assert heights[1] - heights[0] == pytest.approx(rise, rel=1e-5)
 
 
 @pytest.fixture

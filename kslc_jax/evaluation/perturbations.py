@@ -119,7 +119,8 @@ def terrain(text: str) -> TerrainConfig:
         raise ConfigError(f"ground: {text}: {error}") from None
     except ValueError:
         raise ConfigError(
-            f"ground: cannot read {text!r} (known: rough:METRES, slope:DEGREES, stairs:METRES)"
+            f"ground: cannot read {text!r} (known: rough:METRES, slope:DEGREES, stairs:METRES, "
+            "each above 0)"
         ) from None
 
 

@@ -2,7 +2,7 @@
 
 A schedule is a sequence of legs, see `schedules`. A change is the start of a leg. Speeds are
 averaged over `WINDOW`, about one gait cycle. The leg in which a robot falls counts only in the
-survival.
+survival. A tour has way-points in place of changes.
 """
 
 import dataclasses
@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from kslc_jax.evaluation.schedules import PATIENCE
 from kslc_jax.evaluation.trials import Trace
 
 WINDOW = 0.5
@@ -40,7 +41,7 @@ class Change:
     error: float  # m/s, mean velocity error over the first `AFTER` seconds
     settle: float | None  # s until settled; None if the leg ended before
     stop: tuple[float, float] | None  # s and m until at rest; None if not a stop, or not at rest
-    drift: float | None  # m/s, mean speed over ground after the stop
+    drift: float | None  # m/s, distance between rest and the end of the leg, over the time
     stops: bool  # True if the command is to stop, from at least `FROM`
 
 
@@ -51,25 +52,16 @@ def summary(trace: Trace, dt: float) -> dict[str, float]:
     settled (share of the changes), stop_seconds, stop_metres, stop_metres_most, stopped (share of
     the stops), drift [m/s], forward_mean [m/s], yaw_rate_std [rad/s].
     """
-    alive = np.asarray(trace.alive)
-    count, found = alive.shape[1], []
+    count, found = np.asarray(trace.alive).shape[1], []
     for i in range(count):
         found += _changes(trace, i, dt)
-    upright = alive[-1]
-    out = {
-        "survival": float(upright.mean()),
-        "changes": len(found) / count,
-        "forward_mean": float(np.asarray(trace.linvel)[..., 0][alive].mean()),
-        "yaw_rate_std": float(np.asarray(trace.angvel)[..., 2][alive].std()),
-    }
-    if not upright.all():
-        out["seconds_to_fall"] = float(alive[:, ~upright].sum(0).mean() * dt)
     stops = [c for c in found if c.stops]
     done = [c.stop for c in stops if c.stop is not None]
     settle = [c.settle for c in found if c.settle is not None]
     drift = [c.drift for c in stops if c.drift is not None]
     return (
-        out
+        _motion(trace, dt)
+        | {"changes": len(found) / count}
         | _mean("change_error", [c.error for c in found])
         | _mean("settle_seconds", settle)
         | _mean("settled", [c.settle is not None for c in found])
@@ -79,6 +71,40 @@ def summary(trace: Trace, dt: float) -> dict[str, float]:
         | _mean("stopped", [c.stop is not None for c in stops])
         | _mean("drift", drift)
     )
+
+
+def tour(trace: Trace, dt: float) -> dict[str, float]:
+    """Survival, and how quickly the robots reach way-points, from a trace of a tour.
+
+    Keys: survival, seconds_to_fall, way_points (reached per minute of a robot that is upright),
+    given_up (way-points per robot, see `schedules.PATIENCE`), forward_mean, yaw_rate_std.
+    """
+    alive, leg = np.asarray(trace.alive), np.asarray(trace.leg)
+    steps = [
+        length
+        for numbers, upright in zip(leg.T, alive.T, strict=True)
+        for length in np.bincount(numbers[upright])[:-1]  # the last leg has not ended
+    ]
+    reached = np.array(steps) * dt < PATIENCE - 0.5 * dt
+    minutes = alive.sum() * dt / 60.0
+    return _motion(trace, dt) | {
+        "way_points": float(reached.sum() / minutes),
+        "given_up": float((~reached).sum() / alive.shape[1]),
+    }
+
+
+def _motion(trace: Trace, dt: float) -> dict[str, float]:
+    """Survival and mean motion, whatever the commands."""
+    alive = np.asarray(trace.alive)
+    upright = alive[-1]
+    out = {
+        "survival": float(upright.mean()),
+        "forward_mean": float(np.asarray(trace.linvel)[..., 0][alive].mean()),
+        "yaw_rate_std": float(np.asarray(trace.angvel)[..., 2][alive].std()),
+    }
+    if not upright.all():
+        out["seconds_to_fall"] = float(alive[:, ~upright].sum(0).mean() * dt)
+    return out
 
 
 def _mean(name: str, values: list) -> dict[str, float]:

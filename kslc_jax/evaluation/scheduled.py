@@ -13,6 +13,8 @@ from kslc_jax.policy import Policy
 COLUMNS = (
     ("survival", "survived", "{:.0%}"),
     ("seconds_to_fall", "fell at [s]", "{:.0f}"),
+    ("way_points", "way-points a minute", "{:.1f}"),
+    ("given_up", "given up", "{:.1f}"),
     ("changes", "changes", "{:.1f}"),
     ("forward_mean", "mean vx [m/s]", "{:.2f}"),
     ("change_error", "error after a change [m/s]", "{:.2f}"),
@@ -24,7 +26,7 @@ COLUMNS = (
     ("drift", "drift at rest [m/s]", "{:.3f}"),
     ("yaw_rate_std", "yaw std", "{:.2f}"),
 )
-"""(metric, heading, format) of each column of the table."""
+"""(metric, heading, format) of the columns. A table has those that one of its rows needs."""
 
 
 def measure(
@@ -35,7 +37,7 @@ def measure(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> list[dict[str, Any]]:
-    """One row per schedule: metrics of `reaction.summary`, falls, and the speeds of a few robots.
+    """One row per schedule: metrics of `reaction`, falls, and the speeds of a few robots.
 
     Args:
       policy: acts deterministically.
@@ -55,7 +57,7 @@ def measure(
         trace = trials.join(pieces)
         what = {"schedule": schedule.name, "top": schedule.top}
         how = {"falls": reaction.falls(trace, dt), "series": reaction.series(trace, dt)}
-        numbers = reaction.summary(trace, dt)
+        numbers = (reaction.tour if schedule.tour else reaction.summary)(trace, dt)
         rows.append(what | numbers | how | trained.beyond(policy, tried))
     return rows
 
@@ -65,16 +67,16 @@ def table(results: dict[str, list[dict[str, Any]]], title: str):
     from rich.markup import escape
     from rich.table import Table
 
-    caption = None
-    if any("beyond" in row for rows in results.values() for row in rows):
-        caption = tables.BEYOND
+    found = {name for rows in results.values() for row in rows for name in row}
+    columns = [column for column in COLUMNS if column[0] in found]
+    caption = tables.caption(row for rows in results.values() for row in rows)
     out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     out.add_column("condition")
     out.add_column("schedule")
-    for _, label, _ in COLUMNS:
+    for _, label, _ in columns:
         out.add_column(escape(label), justify="right")  # rich would read [m/s] as a style
     for condition, rows in results.items():
         for row in rows:
-            cells = [form.format(row[name]) if name in row else "-" for name, _, form in COLUMNS]
+            cells = [form.format(row[name]) if name in row else "-" for name, _, form in columns]
             out.add_row(condition, row["schedule"] + "*" * ("beyond" in row), *cells)
     return out

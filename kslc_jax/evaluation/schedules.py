@@ -138,9 +138,11 @@ def _read(path: Path, top: float | None) -> Schedule:
     """Reads a user's schedule. `top` [m/s], if given, limits its forward speeds."""
     try:
         content = json.loads(path.read_text())
-    except OSError:
+    except FileNotFoundError:
         known = ", ".join(NAMES)
         raise ConfigError(f"schedule: no file {str(path)!r} (known names: {known})") from None
+    except OSError as error:
+        raise ConfigError(f"schedule: cannot read {path}: {error.strerror}") from None
     except (ValueError, RecursionError):
         raise ConfigError(f"schedule: {path} is not JSON") from None
     if not isinstance(content, list) or not content:
@@ -153,19 +155,29 @@ def _read(path: Path, top: float | None) -> Schedule:
 
 
 def _step(path: Path, index: int, entry: Any) -> Step:
-    try:
-        step = Step(**{name: float(value) for name, value in entry.items()})
-        numbers = [x for x in dataclasses.astuple(step) if x is not None]
-    except (TypeError, ValueError, AttributeError):
-        names = ", ".join(f.name for f in dataclasses.fields(Step))
-        raise ConfigError(
-            f"schedule: step {index} of {path} needs numbers for seconds and vx (known: {names})"
-        ) from None
-    if not all(map(math.isfinite, numbers)) or step.seconds <= 0:
-        raise ConfigError(f"schedule: step {index} of {path}: finite numbers, seconds above 0")
+    where = f"schedule: step {index} of {path}"
+    if not (isinstance(entry, dict) and {"seconds", "vx"} <= entry.keys()):
+        raise ConfigError(f"{where} needs seconds and vx")
+    names = [field.name for field in dataclasses.fields(Step)]
+    for name, value in entry.items():
+        if name not in names:
+            raise ConfigError(f"{where} has the unknown name {name!r} (known: {', '.join(names)})")
+        if not _is_number(value):
+            raise ConfigError(f"{where}: {name} must be a finite number")
+    step = Step(**{name: float(value) for name, value in entry.items()})
+    if step.seconds <= 0:
+        raise ConfigError(f"{where}: seconds must be above 0")
     if step.yaw_rate and step.heading is not None:
-        raise ConfigError(f"schedule: step {index} of {path} has both yaw_rate and heading")
+        raise ConfigError(f"{where} has both yaw_rate and heading")
     return step
+
+
+def _is_number(value: Any) -> bool:
+    """True for a number that a float holds: JSON also has NaN, infinity and endless integers."""
+    try:
+        return isinstance(value, (int, float)) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 # ------------------------------------------------------------------------------------------- legs

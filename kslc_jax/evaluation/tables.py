@@ -2,7 +2,8 @@
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -43,6 +44,11 @@ BEYOND = "* beyond what the policy was trained for; 'beyond' in the JSON says wh
 """Caption of a table with marked rows."""
 
 
+def caption(rows: Iterable[Mapping[str, Any]]) -> str | None:
+    """What an asterisk means, if one of the rows goes beyond the training."""
+    return BEYOND if any("beyond" in row for row in rows) else None
+
+
 def speed(command: float) -> str:
     """A commanded speed [m/s] with one digit, or with as many as it has: 0.5, 0.45."""
     return f"{command:.1f}" if math.isclose(command, round(command, 1)) else f"{command:g}"
@@ -50,8 +56,7 @@ def speed(command: float) -> str:
 
 def table(rows: Sequence[Row], title: str, columns: Columns = HEADLINE) -> Table:
     """A table with one line per commanded speed. An asterisk marks rows with the entry `beyond`."""
-    caption = BEYOND if any("beyond" in row for row in rows) else None
-    out = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    out = Table(title=title, title_justify="left", caption=caption(rows), caption_justify="left")
     for label in ("command [m/s]", *(label for _, label, _ in columns)):
         out.add_column(escape(label), justify="right")  # rich would read [m/s] as a style
     for row in rows:

@@ -158,31 +158,41 @@ def gait_strip(
     cam = camera(0.0, elevation=-6.0)
     across, floors = shown[:, 1].mean(), np.zeros(1)
     if ground is not None:
-        put_ground(robot, model, _row(ground, 0), middle, across)
         floors = ground_lib.height(_row(ground, 0), shown[:, 0], shown[:, 1], np)
     # A long lens far away shows all images from the same angle. The distance makes all of them fit.
     half_height = np.tan(np.radians(LONG_LENS / 2))
     tall = TALL * size + np.ptp(floors)
     cam.distance = 0.5 * max(length * height / width, tall) / half_height
     cam.lookat[:] = [middle, across, EYE_LEVEL * size + floors.mean()]
-    data = mujoco.MjData(model)
+    data, options = mujoco.MjData(model), (mujoco.MjvOption(), mujoco.MjvPerturb())
     model.vis.global_.fovy = LONG_LENS
+    windows: set[tuple[float, ...]] = set()  # places of the height fields that the picture has
     with _renderer(model, height, width, max_geom=20_000) as renderer:
         for i, q in enumerate(shown):
             data.qpos[:] = q
+            new = ground is not None and _put_window(robot, model, _row(ground, 0), q, windows)
             mujoco.mj_forward(model, data)
             if i == 0:
                 renderer.update_scene(data, cam)
                 continue
-            mujoco.mjv_addGeoms(
-                model,
-                data,
-                mujoco.MjvOption(),
-                mujoco.MjvPerturb(),
-                mujoco.mjtCatBit.mjCAT_DYNAMIC,
-                renderer.scene,
-            )
+            what = mujoco.mjtCatBit.mjCAT_ALL if new else mujoco.mjtCatBit.mjCAT_DYNAMIC
+            mujoco.mjv_addGeoms(model, data, *options, what, renderer.scene)
         return renderer.render()
+
+
+def _put_window(
+    robot: Robot, model: mujoco.MjModel, ground: Ground, qpos: np.ndarray, known: set
+) -> bool:
+    """Moves the height field below a robot; True if no robot before it stood on this one.
+
+    A height field is a window of the ground. A strip may be longer than one.
+    """
+    put_ground(robot, model, ground, qpos[0], qpos[1])
+    (floor,) = robot.ground_geom_ids
+    place = tuple(model.geom_pos[floor])
+    new = place not in known
+    known.add(place)
+    return new
 
 
 def stack(pictures: Sequence[np.ndarray]) -> np.ndarray:
