@@ -5,14 +5,18 @@ It runs in turn: physics alone (random actions), the rollout, and the whole trai
   python -m benchmarks.throughput [--preset laptop] [--repeats 5] [--engines mujoco mjx]
 
 With --robot it runs in turn the whole train step of XBot-L and of that robot; with --cones, that of
-elliptic friction cones and of pyramids.
+elliptic friction cones and of pyramids; with --pieces, that in which a CPU takes a minibatch in
+pieces, as it does, and that in which it takes it whole.
 
   python -m benchmarks.throughput --robot unitree_g1 --engines mujoco
   python -m benchmarks.throughput --cones
+  python -m benchmarks.throughput --pieces --engines mujoco
 """
 
 import dataclasses
-from collections.abc import Callable
+import functools
+import unittest.mock
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,7 +25,7 @@ import jax
 import tyro
 
 from benchmarks import timing
-from kslc_jax import motors, physics, similar, train_step
+from kslc_jax import motors, physics, ppo, similar, train_step
 from kslc_jax import rollout as rollout_lib
 from kslc_jax.config import XBOT_L, Config, PhysicsConfig, preset
 
@@ -72,6 +76,15 @@ def stepping(init: Callable[[], Any], step: Callable[[Any], tuple[Any, Any]]) ->
     return run
 
 
+def whole_minibatches(config: Config) -> Callable[[], Any]:
+    """`training` in which a CPU takes each minibatch whole, see `ppo.pieces`."""
+    init, _ = train_step.make(config)
+    step = jax.jit(functools.partial(train_step.step, config), donate_argnums=0)
+    with unittest.mock.patch.object(ppo, "pieces", lambda size: 1):
+        compiled = step.lower(jax.eval_shape(init)).compile()
+    return stepping(init, compiled)
+
+
 PARTS = {"physics only": physics_only, "rollout": rollout, "whole training": training}
 
 
@@ -99,29 +112,36 @@ class Args:
     cones: bool = False
     """Compare the preset's elliptic cones with the pyramids of older runs, and their iterations;
     with --robot, for that robot."""
+    pieces: bool = False
+    """Compare a train step that takes each minibatch in pieces with one that takes it whole."""
     json: Path | None = None
     """File for the numbers."""
 
 
-def variants(args: Args, configs: dict[str, Config]) -> None:
-    """Prints the control steps/s of whole training of several configs, and their ratio to the
+Made = tuple[Callable[[Config], Callable[[], Any]], Config]
+"""A function such as `training`, and its config."""
+
+
+def variants(args: Args, made: Mapping[str, Made]) -> None:
+    """Prints the control steps/s of whole training of several variants, and their ratio to the
     first."""
     rates: dict[str, dict[str, float]] = {}
     for engine in args.engines:
-        runs = {name: training(timing.on_engine(c, engine)) for name, c in configs.items()}
+        runs = {name: make(timing.on_engine(c, engine)) for name, (make, c) in made.items()}
         seconds = timing.medians(timing.in_turn(runs, args.repeats))
-        rates[engine] = {name: c.batch_size / seconds[name] for name, c in configs.items()}
-        first = next(iter(configs))
+        rates[engine] = {name: c.batch_size / seconds[name] for name, (_, c) in made.items()}
+        first = next(iter(made))
         for name, rate in rates[engine].items():
             ratio = rate / rates[engine][first]
             print(f"{engine:8} {name:16} {rate:9.0f} steps/s   {ratio:5.2f} of {first}", flush=True)
     timing.report({"preset": args.preset, "steps_per_second": rates}, args.json)
 
 
-def cones(base: Config) -> dict[str, Config]:
+def cones(base: Config) -> dict[str, Made]:
     """A config with both shapes of the friction cone."""
     before = PhysicsConfig(robot=base.physics.robot)  # the defaults are those of older runs
-    return {"elliptic": base, "pyramidal": dataclasses.replace(base, physics=before)}
+    pyramidal = dataclasses.replace(base, physics=before)
+    return {"elliptic": (training, base), "pyramidal": (training, pyramidal)}
 
 
 def main(args: Args) -> None:
@@ -130,9 +150,13 @@ def main(args: Args) -> None:
     if args.cones:
         variants(args, cones(base))
         return
+    if args.pieces:
+        variants(args, {"in pieces": (training, base), "whole": (whole_minibatches, base)})
+        return
     if args.robot is not None:
         xbot = timing.resized(preset(args.preset), args.num_envs)
-        variants(args, {physics.robot_for(c.physics).name: c for c in (xbot, base)})
+        named = {physics.robot_for(c.physics).name: (training, c) for c in (xbot, base)}
+        variants(args, named)
         return
     results = {}
     for engine in args.engines:

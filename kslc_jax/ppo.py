@@ -128,14 +128,15 @@ def loss(
     constants: RolloutConstants,
     params: Params,
     batch: Samples,
+    count: jax.Array,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """(loss [], metrics) over the valid samples of `batch`.
+    """(loss [], metrics): the share of `batch` in the mean over `count` [] valid samples.
 
     The loss is the clipped surrogate + clipped value loss - entropy bonus + squared error of the
     velocity estimate.
     """
     dist, value, estimate_error = apply(params, batch.index)
-    weight = batch.valid / jnp.maximum(jnp.sum(batch.valid), 1)
+    weight = batch.valid / count
 
     def mean(x: jax.Array) -> jax.Array:
         return jnp.sum(x * weight)
@@ -148,7 +149,8 @@ def loss(
     errors = jnp.maximum(jnp.square(value - batch.target), jnp.square(near - batch.target))
     value_loss = mean(errors)
 
-    entropy, estimate_loss = dist.entropy(), mean(estimate_error)
+    entropy = dist.entropy() * jnp.sum(weight)
+    estimate_loss = mean(estimate_error)
     total = policy_loss + config.value_coef * value_loss - constants.entropy_coef * entropy
     total += config.estimate_coef * estimate_loss
     info = {
@@ -175,6 +177,42 @@ def adapt_learning_rate(
     return jnp.clip(jnp.minimum(rate, ceiling), *config.learning_rate_bounds)
 
 
+PIECE = 1536
+"""Samples whose gradient a CPU computes at once. The layers of so few samples stay in its caches.
+`python -m benchmarks.throughput --pieces` measures what that saves."""
+
+
+def pieces(size: int) -> int:
+    """Number of equal pieces, of `PIECE` samples or more, in which a CPU takes `size` samples."""
+    if jax.default_backend() != "cpu":
+        return 1
+    return max(n for n in range(1, max(size // PIECE, 1) + 1) if size % n == 0)
+
+
+def gradient(
+    config: PPOConfig,
+    apply: PolicyAtIndex,
+    constants: RolloutConstants,
+    params: Params,
+    batch: Samples,
+) -> tuple[Params, dict[str, jax.Array]]:
+    """Gradient of the loss over one minibatch, and the metrics; the sum over its `pieces`."""
+    count = jnp.maximum(jnp.sum(batch.valid), 1)
+
+    def of(piece: Samples) -> tuple[Params, dict[str, jax.Array]]:
+        slope = jax.grad(loss, argnums=3, has_aux=True)
+        return slope(config, apply, constants, params, piece, count)
+
+    number = pieces(batch.index.shape[0])
+    if number == 1:
+        return of(batch)
+    parts = jax.tree.map(lambda x: x.reshape(number, -1, *x.shape[1:]), batch)
+    like = jax.eval_shape(of, jax.tree.map(lambda x: x[0], parts))
+    zero = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like)
+    total, _ = jax.lax.scan(lambda t, p: (jax.tree.map(jnp.add, t, of(p)), None), zero, parts)
+    return total
+
+
 def gradient_step(
     config: PPOConfig,
     apply: PolicyAtIndex,
@@ -186,9 +224,7 @@ def gradient_step(
 
     A non-finite gradient changes nothing; the metric `skipped` is then 1.
     """
-    grads, info = jax.grad(loss, argnums=3, has_aux=True)(
-        config, apply, constants, learner.params, batch
-    )
+    grads, info = gradient(config, apply, constants, learner.params, batch)
     grad_norm = optax.tree.norm(grads)
     ceiling = learner.rate_ceiling
     rate = adapt_learning_rate(config, learner.learning_rate, info["kl"], ceiling)

@@ -194,17 +194,24 @@ def test_gym_environment_is_the_same_robot(debug):
     np.testing.assert_allclose(frames["critic"][-1], critic, atol=1e-5)
 
 
-@pytest.mark.slow(reason="compiles three programs")
 @pytest.mark.slow(reason="compiles two train steps")
-def test_throughput_of_another_robot(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("variants", "first", "second"),
+    [
+        ({"robot": BIPED}, "XBot-L", "biped"),
+        ({"cones": True}, "elliptic", "pyramidal"),
+        ({"pieces": True}, "in pieces", "whole"),
+    ],
+)
+def test_throughput_of_two_variants(variants, first, second, tmp_path, capsys):
     path = tmp_path / "out.json"
-    asked = {"num_envs": 16, "repeats": 1, "engines": ("mujoco",), "robot": BIPED}
+    asked: dict = {"num_envs": 16, "repeats": 1, "engines": ("mujoco",), **variants}
     throughput.main(throughput.Args(preset="debug", json=path, **asked))
     rates = json.loads(path.read_text())["steps_per_second"]["mujoco"]
-    ratio = rates["biped"] / rates["XBot-L"]
-    assert f"{ratio:.2f} of XBot-L" in capsys.readouterr().out
+    assert f"{rates[second] / rates[first]:.2f} of {first}" in capsys.readouterr().out
 
 
+@pytest.mark.slow(reason="compiles three programs")
 def test_throughput(tmp_path):
     """Physics alone is faster than the rollout; the rollout is faster than training."""
     path = tmp_path / "numbers.json"

@@ -17,6 +17,12 @@ def update(config: Config, devices: int = 1) -> float:
     return memory._update(config, *memory.shapes(config), devices)
 
 
+@pytest.fixture
+def on_a_gpu(monkeypatch):
+    """JAX says that its default device is a GPU. So a minibatch is not taken in pieces."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+
+
 SAMPLE = 4 * (16 + 16 + 5) + 1
 """Bytes of one sample: action, mean; index, log_prob, value, advantage, target; valid."""
 
@@ -29,13 +35,23 @@ def test_update_of_the_debug_preset(debug):
     assert update(debug) == pytest.approx(446_080)
 
 
-def test_update_of_the_paper_preset():
-    """4096 environments x 60 steps, 15 and 3 frames, minibatches of 61440, 2048 hidden units."""
+def update_of_paper(at_once: int) -> tuple[int, int]:
+    """Bytes of frames and samples, and of `at_once` samples of a minibatch: 4096 environments x 60
+    steps, 15 and 3 frames, 2048 hidden units."""
     frames = 4 * 4096 * ((60 + 14) * 59 + (60 + 2) * 89)
     samples = 245_760 * SAMPLE
-    minibatch = 4 * 61_440 * (15 * 59 + 3 * 89 + 3 * 2048)
-    assert update(PAPER) == pytest.approx(frames + samples + minibatch)
-    assert update(PAPER, 4) == pytest.approx(frames + samples + minibatch / 4)
+    return frames + samples, 4 * at_once * (15 * 59 + 3 * 89 + 3 * 2048)
+
+
+def test_update_of_the_paper_preset_on_a_cpu():
+    """Each minibatch of 61440 samples is taken in 40 pieces."""
+    assert update(PAPER) == pytest.approx(sum(update_of_paper(1536)))
+
+
+def test_update_of_the_paper_preset_on_gpus(on_a_gpu):
+    all_devices, minibatch = update_of_paper(61_440)
+    assert update(PAPER) == pytest.approx(all_devices + minibatch)
+    assert update(PAPER, 4) == pytest.approx(all_devices + minibatch / 4)
 
 
 def test_rollout():
@@ -60,13 +76,13 @@ def test_shapes_are_those_of_the_program(debug):
     assert memory.shapes(debug)[1] == trajectory
 
 
-def test_the_paper_preset_fits_a_gpu_of_15_gb():
+def test_the_paper_preset_fits_a_gpu_of_15_gb(on_a_gpu):
     need = memory.estimate(PAPER)
     assert 1.5e9 < need < 3e9
     assert memory.estimate(PAPER, devices=4) < 0.5 * need
 
 
-def test_what_cannot_fit_is_refused(monkeypatch):
+def test_what_cannot_fit_is_refused(monkeypatch, on_a_gpu):
     class Device:
         device_kind = "a small GPU"
 

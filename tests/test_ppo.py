@@ -140,7 +140,7 @@ def params(mean=0.0, value=0.0):
 
 class TestLoss:
     def loss(self, params, batch):
-        return ppo.loss(CONFIG, bandit_apply, CONSTANTS, params, batch)
+        return ppo.loss(CONFIG, bandit_apply, CONSTANTS, params, batch, jnp.sum(batch.valid))
 
     def test_total(self):
         total, info = self.loss(params(mean=0.3, value=1.0), samples())
@@ -169,10 +169,52 @@ class TestLoss:
 
     def test_entropy_bonus(self):
         """0.01 x the entropy of N(0, 1), 1.418939."""
-        paid = ppo.loss(
-            CONFIG, bandit_apply, CONSTANTS.replace(entropy_coef=0.01), params(), samples()
-        )[0]
+        constants = CONSTANTS.replace(entropy_coef=0.01)
+        paid = ppo.loss(CONFIG, bandit_apply, constants, params(), samples(), jnp.asarray(2))[0]
         assert self.loss(params(), samples())[0] - paid == pytest.approx(0.01418939, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("size", "number"), [(12_288, 8), (12_289, 1), (61_440, 40), (64, 1), (1536, 1), (3074, 2)]
+)
+def test_a_cpu_takes_a_minibatch_in_equal_pieces(size, number):
+    """12,289 is prime."""
+    assert ppo.pieces(size) == number
+
+
+def test_an_accelerator_takes_a_minibatch_whole(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert ppo.pieces(12_288) == 1
+
+
+def test_the_pieces_of_a_minibatch_add_up(monkeypatch):
+    """Gradient and metrics of four pieces are those of the whole, also if the pieces have unlike
+    numbers of valid samples, and one has none."""
+    key = jax.random.key(0)
+
+    def apply(params, index):
+        dist, value, error = bandit_apply(params, index)
+        return dist, value + params["slope"] * index, error + params["slope"] * index
+
+    values = jax.random.normal(key, (5, 64))
+    batch = ppo.Samples(
+        index=jnp.arange(64),
+        action=values[0, :, None],
+        mean=0.1 * values[1, :, None],
+        log_prob=-1.0 + 0.1 * values[2],
+        value=values[3],
+        advantage=values[4],
+        target=values[3] + 1.0,
+        valid=(jnp.arange(64) >= 16) & (jnp.arange(64) % 7 > 0),
+    )
+    constants = CONSTANTS.replace(entropy_coef=0.01)
+    at = {**params(mean=0.3, value=0.5), "slope": jnp.asarray(0.02)}
+    found = []
+    for number in (1, 4):
+        monkeypatch.setattr(ppo, "pieces", lambda size, number=number: number)
+        found.append(ppo.gradient(CONFIG, apply, constants, at, batch))
+    chex.assert_trees_all_close(*found, rtol=1e-5, atol=1e-6)
+    assert float(found[0][1]["entropy"]) == pytest.approx(1.418939, rel=1e-5)
 
 
 def test_non_finite_gradient_changes_nothing_and_is_counted():
@@ -269,6 +311,6 @@ def test_the_estimates_error_counts_by_its_weight():
         return *bandit_apply(params, index)[:2], jnp.array([1.0, 3.0])
 
     config = PPOConfig(estimate_coef=0.5)
-    without, _ = ppo.loss(config, bandit_apply, CONSTANTS, params(), samples())
-    total, info = ppo.loss(config, apply, CONSTANTS, params(), samples())
+    without, _ = ppo.loss(config, bandit_apply, CONSTANTS, params(), samples(), jnp.asarray(2))
+    total, info = ppo.loss(config, apply, CONSTANTS, params(), samples(), jnp.asarray(2))
     assert info["estimate_loss"] == 2.0 and total - without == pytest.approx(1.0)

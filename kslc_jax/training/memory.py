@@ -1,9 +1,9 @@
 """Memory of a training on each device: an estimate before it compiles, XLA's plan afterwards.
 
 A train step has two phases; the larger one counts. The rollout needs the trajectory and the arrays
-of one control step. The update needs the frames, the samples and one minibatch: its windows of
-frames, and the activations that its networks keep for the gradient. The sizes of arrays come from
-the shapes of the program. The constants below come from XLA's buffer assignments.
+of one control step. The update needs the frames, the samples and one minibatch, on a CPU a piece of
+it: its windows of frames, and the activations that its networks keep for the gradient. The sizes of
+arrays come from the shapes of the program. The constants below come from XLA's buffer assignments.
 docs/performance.md compares the estimate with measurements.
 """
 
@@ -15,7 +15,7 @@ import jax
 
 from kslc_jax import physics, processors, rollout, train_step
 from kslc_jax.config import Config, ConfigError, RunConfig
-from kslc_jax.ppo import Samples
+from kslc_jax.ppo import Samples, pieces
 from kslc_jax.rollout import Trajectory
 from kslc_jax.train_step import TrainState
 
@@ -77,7 +77,8 @@ def _rollout(config: Config, trajectory: Trajectory, environments: float, device
 def _update(
     config: Config, state: TrainState, trajectory: Trajectory, samples: Samples, devices: int
 ) -> float:
-    """Bytes of all frames and samples, which each device holds, and of a device's minibatch."""
+    """Bytes of all frames and samples, which each device holds, and of what it has of a piece of a
+    minibatch."""
     histories = state.env.history, state.env.privileged_history
     before = sum(_bytes(history) * (1 - 1 / history.shape[1]) for history in histories)
     read = trajectory.frame, trajectory.privileged, trajectory.velocity
@@ -86,7 +87,8 @@ def _update(
     inputs = window * (2 if config.network.symmetric else 1)  # a copy in even and odd parts
     units = sum(config.network.actor + config.network.critic + config.network.estimator)
     kept = NUMBER * KEPT_PER_UNIT * units
-    return frames + _bytes(samples) + config.minibatch_size / devices * (inputs + kept)
+    at_once = config.minibatch_size / pieces(config.minibatch_size) / devices
+    return frames + _bytes(samples) + at_once * (inputs + kept)
 
 
 def _bytes(tree: Any) -> int:
