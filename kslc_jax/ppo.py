@@ -183,8 +183,11 @@ PIECE = 1536
 
 
 def pieces(size: int) -> int:
-    """Number of equal pieces, of `PIECE` samples or more, in which a CPU takes `size` samples."""
-    if jax.default_backend() != "cpu":
+    """Number of equal pieces, of `PIECE` samples or more, in which a CPU takes `size` samples.
+
+    Several devices take them whole: a minibatch splits evenly among them, a piece of it need not.
+    """
+    if jax.default_backend() != "cpu" or jax.device_count() > 1:
         return 1
     return max(n for n in range(1, max(size // PIECE, 1) + 1) if size % n == 0)
 

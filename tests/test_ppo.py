@@ -182,8 +182,9 @@ def test_a_cpu_takes_a_minibatch_in_equal_pieces(size, number):
     assert ppo.pieces(size) == number
 
 
-def test_an_accelerator_takes_a_minibatch_whole(monkeypatch):
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+@pytest.mark.parametrize(("name", "value"), [("default_backend", "gpu"), ("device_count", 2)])
+def test_accelerators_and_several_devices_take_a_minibatch_whole(name, value, monkeypatch):
+    monkeypatch.setattr(jax, name, lambda: value)
     assert ppo.pieces(12_288) == 1
 
 
