@@ -26,8 +26,8 @@ class Dynamics:
     kd: jax.Array  # [n] factor on the velocity gain
     motor_strength: jax.Array  # [n] factor on the available torque
     joint_friction: jax.Array  # [n] N m
-    link_mass: jax.Array  # [1 + n] factor on mass and inertia, order of robot.link_body_ids
-    link_com: jax.Array  # [1 + n, 3] m, shift of the centre of mass, link frame, same order
+    link_mass: jax.Array  # [L] factor on mass and inertia, order of robot.link_body_ids
+    link_com: jax.Array  # [L, 3] m, shift of the centre of mass, link frame, same order
     hand_mass: jax.Array  # [] kg added to the last link of each arm
     sole: jax.Array  # [k] m, shift of each sole sphere, see robot.sole_inward
     noise: jax.Array  # [] factor on sensor noise, action noise and action delay
@@ -36,7 +36,7 @@ class Dynamics:
 
 def nominal(robot: Robot, friction: float = 1.0) -> Dynamics:
     """Parameters of the model file, without randomisation."""
-    joints, links = robot.count, robot.count + 1
+    joints, links = robot.count, len(robot.link_body_ids)
     return Dynamics(
         friction=jnp.asarray(friction),
         base_mass=jnp.zeros(()),

@@ -47,7 +47,8 @@ class Robot:
     default_qpos: np.ndarray  # [7 + n] home keyframe
     anatomy: Anatomy
     trunk_body_id: int  # heaviest body outside the limbs; carries the payload
-    link_body_ids: np.ndarray  # [1 + n] the base, then the link after each joint
+    joint_body_ids: np.ndarray  # [n] the link that each joint moves
+    link_body_ids: np.ndarray  # [L] the base, then every link with a joint, each once
     hand_body_ids: np.ndarray  # [2] last link of each arm; [0] for a robot without arms
     hand_points: np.ndarray  # [2, 3] m, centre of each hand, frame of its link
     subtree: np.ndarray  # [B, B] 1 if body `column` is in the subtree of body `row`
@@ -185,7 +186,8 @@ def load(
         default_qpos=home,
         anatomy=parts,
         trunk_body_id=parts.trunk,
-        link_body_ids=np.append(parts.base, links),
+        joint_body_ids=links,
+        link_body_ids=np.array(list(dict.fromkeys([parts.base, *links.tolist()]))),
         hand_body_ids=np.array(hands, int),
         hand_points=_hand_points(model, hands),
         subtree=_subtree(model),

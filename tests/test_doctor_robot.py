@@ -62,6 +62,13 @@ def test_rows_of_the_biped(biped):
     assert facts["observations"] == "actor 38, critic 69"  # 11 + 3 x 9, 33 + 4 x 9
 
 
+def test_an_upright_base_is_told_where_the_keyframe_tilts_it(tmp_path, biped):
+    tilted = f"0 0 0.6 {math.cos(0.1)} {math.sin(0.1)} 0 0"
+    facts = dict(report.fact_rows(broken(tmp_path, "", ("0 0 0.6 1 0 0 0", tilted))))
+    assert facts["base"].endswith("there it is tilted by 0.20 rad")
+    assert "base" not in dict(report.fact_rows(biped))
+
+
 def test_axis_names():
     assert report.axis_name(np.array([0.0, -1.0, 0.02])) == "-y"
     assert report.axis_name(np.array([0.8, 0.0, -0.6])) == "0.80 0.00 -0.60"

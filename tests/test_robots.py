@@ -3,6 +3,7 @@
 The biped of tests/data is small, so that its numbers can be computed by hand.
 """
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,8 +14,17 @@ import numpy as np
 import pytest
 from packages import described
 
-from kslc_jax import fingerprint
-from kslc_jax.robots import anatomy, build, capsules, contacts, description, shapes
+from kslc_jax import fingerprint, randomize, robot
+from kslc_jax.robots import (
+    anatomy,
+    build,
+    capsules,
+    contacts,
+    description,
+    loops,
+    shapes,
+    soles,
+)
 from kslc_jax.robots.description import RobotError
 
 DATA = Path(__file__).parent / "data"
@@ -93,6 +103,11 @@ OPTIONS = ("timestep", "iterations", "ls_iterations")
 
 def model(name: str, fidelity: str = "train") -> mujoco.MjModel:
     return build.spec(described(name), fidelity).compile()
+
+
+def studied(about: description.Description) -> anatomy.Anatomy:
+    m = build.spec(about, "train").compile()
+    return anatomy.study(m, home(m))
 
 
 def home(m: mujoco.MjModel) -> np.ndarray:
@@ -449,10 +464,12 @@ def edited(
     front: bool = False,
     motor: str = "",
     xml: tuple[tuple[str, str], ...] = (),
+    weld: str = "",
 ) -> description.Description:
     """The biped's description with lines added, and its MJCF with a text replaced."""
     text = (DATA / "biped.toml").read_text()
     text = toml + text if front else text + toml
+    text = f'weld = ["{weld}"]\n' + text if weld else text
     text = text.replace("speed = 15", f"speed = 15, {motor}") if motor else text
     mjcf = (DATA / "biped.xml").read_text()
     for old, new in xml:
@@ -518,6 +535,25 @@ def test_refused_names(tmp_path):
         description.read(str(tmp_path / "robot.toml"))
 
 
+def test_a_model_is_no_description(tmp_path):
+    """The message has the lines to write, and they work."""
+    with pytest.raises(RobotError, match="an MJCF needs a description") as refused:
+        description.read("my/biped.xml")
+    lines = re.search(
+        "write three lines to (.*) beside it, (.*) and (.*) and (.*) .rad/s", str(refused.value)
+    )
+    assert lines
+    (tmp_path / lines[1]).write_text("\n".join(lines.groups()[1:]))
+    (tmp_path / "biped.xml").write_text((DATA / "biped.xml").read_text())
+    with pytest.raises(RobotError, match="joints 'port_cant', 'star_cant': no kp, kd; add"):
+        build.spec(description.read(str(tmp_path / lines[1])), "train")
+    (tmp_path / "ship.urdf").write_text("")
+    (tmp_path / "ship.toml").write_text('mjcf = "ship.urdf"')
+    for name in (str(tmp_path / "ship.urdf"), str(tmp_path / "ship.toml")):
+        with pytest.raises(RobotError, match=r"ship\.urdf: a URDF must become an MJCF first"):
+            description.read(name)
+
+
 FREE = "<freejoint/>"
 SHOE = '<geom name="left_foot" type="box" size="0.08 0.03 0.01" pos="0.02 0 -0.03"/>'
 MASS = '<inertial pos="0 0 0" mass="0.4" diaginertia="0.001 0.001 0.001"/>'
@@ -526,7 +562,43 @@ TENDON = '<tendon><fixed><joint joint="mast" coef="1"/></fixed></tendon>\n  <act
 BUOY = """<body name="buoy" pos="3 0 1">
   <joint name="hinge" axis="0 1 0"/><geom size="0.1"/>
 </body></worldbody>"""
+TRUNK = '<geom type="box" size="0.06 0.1 0.12" pos="0 0 0.14" mass="6"/>'
+ADDED, MOTOR = "davit|hook|ear", "{ kp = 20, kd = 1, effort = 20 }"
+TILTED = ("0 0 0.6 1 0 0 0", f"0 0 0.6 {np.cos(0.1)} 0 {np.sin(0.1)} 0")  # by 0.2 rad about y
+
+
+def hinged(name: str, place: str, inside: str = "") -> str:
+    """A body with one joint, and with others inside it."""
+    joint = f'<joint name="{name}" axis="0 1 0"/><geom size="0.02"/>'
+    return f'<body name="{name}" pos="{place}">{joint}{inside}</body>'
+
+
+def arms(*hooks: str, ears: bool = False) -> dict[str, str | tuple]:
+    """Changes that give the biped two arms, which end in these hooks, and two ears."""
+    both = ""
+    for side, y in (("port", 0.15), ("star", -0.15)):
+        ends = "".join(hinged(f"{side}_{x}", f"{i / 10} 0 -0.2") for i, x in enumerate(hooks))
+        both += hinged(f"{side}_davit", f"0 {y} 0.2", ends)
+        both += hinged(f"{side}_ear", f"0 {y / 2} 0.3") if ears else ""
+    zeros = "0 " * both.count("<joint")
+    key = ("0  0 -0.2 1", f"0  {zeros} 0 -0.2 1")
+    return {"xml": ((TRUNK, TRUNK + both), key), "toml": f'"{ADDED}" = {MOTOR}\n'}
+
+
+def tied(weld: str, *joints: str) -> dict[str, str | tuple]:
+    """Changes that give the biped arms with two hooks, and that couple two joints of them: by an
+    equality constraint, and by a tendon. The joints that match `weld` are welded."""
+    one, two = joints
+    equal = f'<equality><joint joint1="{one}" joint2="{two}"/></equality>'
+    coupled = "".join(f'<joint joint="{name}" coef="1"/>' for name in joints)
+    tendon = f"<tendon><fixed>{coupled}</fixed></tendon>\n  <actuator>"
+    made = arms("hook_a", "hook_b")
+    return made | {"xml": (*made["xml"], ("<actuator>", equal + tendon)), "weld": weld}
+
+
 MAST, NOD = '<joint name="mast" axis="0 0 1"/>', '<joint name="nod" axis="0 1 0"/>'
+BALL = '<geom name="left_foot" type="sphere" size="0.04" pos="0 0 -0.03"/>'
+ROUND = '<geom type="capsule" fromto="-0.05 0 -0.03 0.09 0 -0.03" size="0.03"/>'
 ROBOTS = {
     "no free joint": ({"xml": ((FREE, ""), ("0 0 0.6 1 0 0 0", ""))}, "put <freejoint/>"),
     "slide": ({"xml": (('"mast" axis', '"mast" type="slide" axis'),)}, "joint 'mast' is no hinge"),
@@ -544,6 +616,24 @@ ROBOTS = {
     ),
     "not level": ({"toml": "[home]\nrudder = -0.3\n"}, "joint 'port_rudder' is not level at home"),
     "how to level": ({"toml": "[home]\nrudder = -0.3\n"}, "add -0.200 rad to that joint"),
+    "ball": ({"xml": ((SHOE, BALL),)}, "below joint 'port_rudder' is round: turned in any way"),
+    "capsule": ({"xml": ((SHOE, ROUND),)}, "add a box as its sole"),
+    "straightened": (
+        {"xml": (TILTED, ("1 -0.5", "1 -0.7"))},
+        "(the keyframe's base is tilted by 0.20 rad; here it is upright)",
+    ),
+    "forked arms": (
+        arms("hook_a", "hook_b"),
+        "'port_davit' forks, into port_hook_a, port_hook_b: weld all of these branches",
+    ),
+    "ears": (
+        arms("hook", ears=True),
+        "joints 'port_ear' and 'star_ear' are in no leg and no arm: weld them",
+    ),
+    "coupled to a joint that stays": (
+        tied("hook", "port_davit", "port_hook_a"),
+        "equality constraints (closed loops) are not supported",
+    ),
     "no shoe": ({"xml": ((SHOE, MASS),)}, "the foot below joint 'port_rudder' has no shapes"),
     "no gains": (
         {"xml": (('<position joint="mast"/>', ""),)},
@@ -625,6 +715,91 @@ def test_refused_robots(tmp_path, case):
     assert "\n" not in str(refused.value)
 
 
+def test_an_arm_may_fork_where_it_is_welded(tmp_path):
+    """One hook of each hand is left: it is part of the arm."""
+    a = studied(edited(tmp_path, **arms("hook_a", "hook_b"), weld="hook_b"))
+    assert a.limbs["left_arm"] == (1, 2) and a.limbs["right_arm"] == (3, 4)
+
+
+def test_what_couples_welded_joints_only_is_ignored(tmp_path):
+    about = edited(tmp_path, **tied("hook", "port_hook_a", "port_hook_b"))
+    m = build.spec(about, "high").compile()
+    assert (m.neq, m.ntendon, m.nu) == (0, 0, 11)
+
+
+ROPE = '<spatial><site site="s"/><geom geom="g"/><site site="t"/></spatial>'
+LINEAR = '<fixed name="f"><joint joint="j" coef="1"/></fixed>'
+LOOPS = {
+    "one joint": ('<joint joint1="k"/>', "", (True, False, False)),
+    "two joints": ('<joint joint1="j" joint2="k"/>', "", (True, True, False)),
+    "two sites": ('<connect site1="s" site2="t"/>', "", (True, False, False)),
+    "two bodies": ('<weld body1="a" body2="b"/>', "", (True, False, False)),
+    "the world": ('<connect body1="a" anchor="0 0 0"/>', "", (True, True, True)),
+    "a tendon": ('<tendon tendon1="f"/>', LINEAR, (True, True, False)),
+    "a rope": ("", ROPE, (True, False, False)),
+}
+
+
+@pytest.mark.parametrize("case", LOOPS)
+def test_constraints_bind_what_moves(case):
+    """b turns on a by k, a on the free base by j: nothing is welded, then k, then both."""
+    equality, tendon, binds = LOOPS[case]
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+      <body><freejoint/><geom size="0.1"/>
+        <body name="a"><joint name="j"/><geom size="0.1"/><site name="s"/>
+          <body name="b"><joint name="k"/><geom name="g" size="0.1"/><site name="t" pos="0 0 1"/>
+      </body></body></body></worldbody>
+      <tendon>{tendon}</tendon><equality>{equality}</equality></mujoco>""")
+    welds = (frozenset(w) for w in ((), (2,), (1, 2)))
+    assert tuple(bool(loops.found(model, weld)) for weld in welds) == binds
+
+
+@pytest.mark.parametrize(
+    "kind", ["box", "rounded box", "ball", "capsule", "cylinder", "tilted box"]
+)
+def test_round_feet_are_told_from_flat_ones(kind):
+    """A sole that is flat, but not level, is no round one, and an edge may be rounded."""
+    shapes_of = {"ball": ("sphere", "0.05"), "capsule": ("capsule", "0.03 0.07")}
+    shapes_of["cylinder"] = ("cylinder", "0.03 0.07")
+    geom, size = shapes_of.get(kind, ("box", "0.1 0.04 0.02"))
+    turn = {"capsule": 1.5708, "cylinder": 1.5708, "tilted box": 0.2}.get(kind, 0)
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler angle="radian"/><worldbody><geom type="{geom}" size="{size}" '
+        f'euler="0 {turn} 0"/></worldbody></mujoco>'
+    )
+    frame = np.zeros(9)
+    mujoco.mju_quat2Mat(frame, model.geom_quat[0])
+    points = shapes.points(model, 0) @ frame.reshape(3, 3).T
+    if kind == "rounded box":
+        points = np.clip(points, [-0.09, -0.03, -0.01], [0.09, 0.03, 0.01])
+        points = points + 0.01 * np.sign(points) / 3**0.5
+    said = {"box": "", "rounded box": "", "tilted box": "not level"}.get(kind, "is round")
+    try:
+        soles.find(points, "ankle", 1.0)
+        assert not said
+    except RobotError as error:
+        assert said and said in str(error)
+
+
+def test_bodies_with_several_joints(tmp_path):
+    """Two joints move each boom; each link differs from its description once."""
+    joint = '<joint name="{}_cant" axis="{} 0 0" range="-0.4 0.6"/>'
+    twist = '<joint name="{}_twist" axis="0 0 {}"/>'
+    sides = (("port", 1), ("star", -1))
+    both = [(joint.format(*s), joint.format(*s) + twist.format(*s)) for s in sides]
+    key = ("0  0 -0.2 1 -0.5  0 -0.2", "0  0 0 -0.2 1 -0.5  0 0 -0.2")
+    motor = f'"twist" = {MOTOR}\n'
+    edited(tmp_path, xml=(*both, key), toml=motor)
+    it = robot.load(name=str(tmp_path / "biped.toml"))
+    assert it.count == 11 and len(it.link_body_ids) == 10
+    names = [it.mj_model.body(i).name for i in it.joint_body_ids]
+    assert names[1:3] == ["port_boom", "port_boom"] and names[3] == "port_spar"
+    heavier = randomize.nominal(it)
+    heavier = heavier.replace(link_mass=1.1 * heavier.link_mass)
+    assert float(randomize.total_mass(it, heavier)) == pytest.approx(1.1 * it.total_mass)
+    assert {it.anatomy.roles[f"left_{r}"] for r in ("hip_roll", "hip_yaw")} == {1, 2}
+
+
 def test_menagerie_is_looked_for_in_order(tmp_path, monkeypatch):
     monkeypatch.setattr(description, "_package", lambda name: None)
     monkeypatch.delenv(description.MENAGERIE_ROOT, raising=False)
@@ -665,6 +840,19 @@ def test_a_robot_of_menagerie_is_downloaded_and_what_fails_is_one_line(tmp_path,
         with pytest.raises(RobotError) as refused:
             description.read(str(path))
         assert str(refused.value).endswith(said)
+
+
+def test_a_package_with_an_mjcf_is_not_imported(tmp_path, monkeypatch):
+    """Its import would fail, or take seconds."""
+    package = tmp_path / "shipyard"
+    (package / "models").mkdir(parents=True)
+    (package / "__init__.py").write_text("raise ImportError('imported')")
+    (package / "models" / "ship.xml").write_text("<mujoco/>")
+    monkeypatch.syspath_prepend(tmp_path)
+    path = tmp_path / "robot.toml"
+    path.write_text('mjcf = "shipyard:models/ship.xml"')
+    assert description.read(str(path)).mjcf == package / "models" / "ship.xml"
+    assert "shipyard" not in sys.modules
 
 
 def test_mjcf_in_a_package(tmp_path):

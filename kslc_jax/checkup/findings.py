@@ -126,7 +126,7 @@ def action_scale(x: Patient) -> Iterator[Finding]:
 
 def masses(x: Patient) -> Iterator[Finding]:
     """Links of no mass."""
-    links = x.train.mj_model.body_mass[x.train.link_body_ids[1:]]
+    links = x.train.mj_model.body_mass[x.train.joint_body_ids]
     for names, value in x.both(-links):
         if -value < LIGHT:
             yield Finding(
@@ -162,7 +162,7 @@ def asymmetry(x: Patient) -> Iterator[Finding]:
     partner, sign = robot.anatomy.permutation, robot.anatomy.sign
     ranges = np.stack([robot.joint_lower, robot.joint_upper])
     mirrored = np.where(sign > 0, ranges[:, partner], -ranges[::-1, partner])
-    links = robot.mj_model.body_mass[robot.link_body_ids[1:]]
+    links = robot.mj_model.body_mass[robot.joint_body_ids]
     links = np.where(links > SMALL * robot.total_mass, links, 0)
     numbers = {
         "motors: kp": robot.kp,

@@ -17,6 +17,7 @@ from kslc_jax.checkup import findings, picture, statics, trials
 from kslc_jax.checkup.findings import Finding, Patient
 from kslc_jax.config import PhysicsConfig, TerrainConfig
 from kslc_jax.robot import Robot
+from kslc_jax.robots import build, description
 from kslc_jax.robots.build import SIDES
 
 PLAIN_WIDTH = 110
@@ -194,7 +195,9 @@ def fact_rows(x: Patient) -> list[tuple[str, str]]:
     count, parts = model.npair, len(set(model.pair_geom1) | set(model.pair_geom2))
     widths = observations.actor_width(it), observations.critic_width(it, config.env.critic_memory)
     base, trunk = model.body(it.anatomy.base).name, it.trunk_body_id
-    return [
+    tilted = build.straightened(description.read(config.physics.robot))
+    told = f"upright, with the keyframe's joint angles; there it is tilted by {tilted:.2f} rad"
+    return [("base", told)] * (tilted > 0) + [
         ("mass", f"{it.total_mass:.1f} kg, {it.mass_ratio:.2f} of XBot-L's"),
         ("standing height", size.format(it.stand_height, it.length_ratio) + f" ({base})"),
         ("trunk", f"{model.body(trunk).name}, {model.body_mass[trunk]:.1f} kg"),

@@ -98,7 +98,7 @@ def link_names(robot: Robot, contact: mujoco.MjContact) -> tuple[str, str]:
 
 def limb_of_bodies(robot: Robot) -> list[str]:
     """Limb of each body: "left_leg", ..., or "trunk"."""
-    bodies, limbs = robot.link_body_ids[1:], ["trunk"] * robot.mj_model.nbody
+    bodies, limbs = robot.joint_body_ids, ["trunk"] * robot.mj_model.nbody
     for limb, joints in robot.anatomy.limbs.items():
         for joint in joints:
             limbs[bodies[joint]] = limb

@@ -189,7 +189,7 @@ def symmetry(trace: Trace, robot: Robot, dt: float) -> dict[str, float]:
 def _bodies_of(robot: Robot, part: str) -> np.ndarray:
     """Mask [bodies] bool of the bodies that belong to the limbs `part`, "arm" or "leg"."""
     first = [
-        robot.link_body_ids[1 + joints[0]]
+        robot.joint_body_ids[joints[0]]
         for limb, joints in robot.anatomy.limbs.items()
         if limb.endswith(part)
     ]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from kslc_jax.robots import loops
 from kslc_jax.robots.description import RobotError
 
 ANCHOR_TOLERANCE = 0.005
@@ -58,6 +59,7 @@ def study(model: mujoco.MjModel, qpos: np.ndarray) -> Anatomy:
     legs, arms = _legs_and_arms(_chains(model), permutation, anchors)
     limbs = {f"{side}_leg": leg for side, leg in zip(("left", "right"), legs, strict=True)}
     limbs |= {f"{side}_arm": arm for side, arm in zip(("left", "right"), arms, strict=False)}
+    _require_in_limbs(model, limbs, permutation)
     bodies = model.jnt_bodyid[1:]
     return Anatomy(
         permutation=permutation,
@@ -81,9 +83,11 @@ def check(model: mujoco.MjModel, welded: frozenset[int] = frozenset()) -> None:
     free, hinge = mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_HINGE
     if model.njnt == 0 or model.jnt_type[0] != free:
         raise RobotError("the first joint is no free joint: put <freejoint/> into the base body")
-    if model.neq or model.ntendon:
-        kind = "equality constraints" if model.neq else "tendons"
-        raise RobotError(f"{kind} (closed loops) are not supported: remove them from the MJCF")
+    if bound := loops.found(model, welded):
+        raise RobotError(
+            f"{bound} (closed loops) are not supported: remove them from the MJCF, or weld all "
+            "joints that they couple"
+        )
     base = model.jnt_bodyid[0]
     for i in (i for i in range(1, model.njnt) if i not in welded):
         name = model.joint(i).name
@@ -169,6 +173,36 @@ def _legs_and_arms(
     legs = min(pairs, key=lambda pair: anchors[pair[0][-1], _Z])
     others = [pair for pair in pairs if pair is not legs]
     return legs, max(others, key=lambda pair: len(pair[0]), default=[])
+
+
+def _require_in_limbs(
+    model: mujoco.MjModel, limbs: dict[str, tuple[int, ...]], partner: np.ndarray
+) -> None:
+    """Refuses joints with a partner on the other side that are in no limb."""
+    inside = {joint for joints in limbs.values() for joint in joints}
+    left_out = [j for j, other in enumerate(partner) if j != other and j not in inside]
+    if not left_out:
+        return
+    first = left_out[0]
+    name, other = (model.joint(1 + int(joint)).name for joint in (first, partner[first]))
+    branches = [c[0] for c in _chains(model) if c and _is_below(model, c[0], first)]
+    if len(branches) > 1:
+        names = ", ".join(model.joint(1 + joint).name for joint in sorted(branches))
+        raise RobotError(
+            f"the limb with joint {name!r} forks, into {names}: weld all of these branches, such "
+            "as the fingers of a hand, or all but one"
+        )
+    raise RobotError(f"joints {name!r} and {other!r} are in no leg and no arm: weld them")
+
+
+def _is_below(model: mujoco.MjModel, joint: int, above: int) -> bool:
+    """True if a joint's body is in the subtree of another joint's body, and is not this body."""
+    body, top = model.jnt_bodyid[1 + joint], model.jnt_bodyid[1 + above]
+    while body > top:
+        body = model.body_parentid[body]
+        if body == top:
+            return True
+    return False
 
 
 def _roles(

@@ -86,6 +86,13 @@ def changed_at(about: Description) -> int:
     return max(file.stat().st_mtime_ns for file in found if file.exists())
 
 
+def straightened(about: Description) -> float:
+    """Angle [rad] by which the MJCF's keyframe tilts the base, which is upright here; else 0."""
+    if about.prepared:
+        return 0.0
+    return skeleton.tilt(about, _compiled(about.mjcf, changed_at(about)))
+
+
 @functools.lru_cache(maxsize=2)
 def _compiled(mjcf: Path, changed: int) -> mujoco.MjModel:
     """An MJCF as it is (cached, because meshes take seconds); `changed` is of `changed_at`."""
@@ -174,7 +181,8 @@ def _assemble(made: mujoco.MjSpec, source: Source) -> Rig:
     for side, foot in zip(SIDES, anatomy.feet, strict=True):
         ankle = anatomy.roles[f"{side}_ankle"]
         points = shapes.surface(source, shapes.of_bodies(source, [bodies[foot - 1]]))
-        found.append(soles.find(points, source.names[ankle], float(anatomy.pitch[ankle])))
+        pitch, joint = float(anatomy.pitch[ankle]), source.names[ankle]
+        found.append(soles.find(points, joint, pitch, source.straightened))
     left, right = found
     stand_height = -min(left.centre[2], right.centre[2])
     return Rig(made, source, bodies, bare, anatomy, (left, right), float(stand_height))

@@ -7,8 +7,9 @@
     [motors]                            # pattern = gains and limits, SI units
     knee = { kp = 200, kd = 5, effort = 139, speed = 20 }
 
-Patterns are regular expressions that are searched in joint names. A later entry wins. All fields
-but `mjcf` are optional: the MJCF's value holds where the description has none.
+Patterns are regular expressions that are searched in joint names. A later entry wins. `mjcf` and
+each motor's `speed`, which no MJCF has, are needed. All else is optional: the MJCF's value holds
+where the description has none.
 """
 
 import difflib
@@ -109,12 +110,30 @@ def _file(name_or_path: str) -> Path:
     if not name_or_path.endswith(".toml"):
         if name_or_path in known():
             return FOLDER / f"{name_or_path}.toml"
+        _require_no_model(Path(name_or_path))
         message = f"unknown robot {name_or_path!r}{_closest(name_or_path, known())}; "
         raise RobotError(message + f"shipped: {', '.join(known())}; or give a path of a .toml file")
     path = Path(name_or_path).expanduser().resolve()
     if not path.is_file():
         raise RobotError(f"{path}: no such file; shipped robots: {', '.join(known())}")
     return path
+
+
+def _require_no_model(path: Path) -> None:
+    """Refuses a model of a robot where a description is wanted."""
+    if path.suffix.lower() == ".urdf":
+        raise RobotError(
+            f"{path}: a URDF must become an MJCF first: spec = "
+            f"mujoco.MjSpec.from_file({path.name!r}); spec.worldbody.first_body().add_freejoint(); "
+            f"spec.compile(); then write spec.to_xml() to {path.stem}.xml, and describe that "
+            "(docs/own_robot.md)"
+        )
+    if path.suffix.lower() in (".xml", ".mjcf"):
+        raise RobotError(
+            f"{path}: an MJCF needs a description: write three lines to {path.stem}.toml beside "
+            f'it, mjcf = "{path.name}" and [motors] and "." = {{ speed = 12 }} (rad/s without '
+            "load), and give the path of that (docs/own_robot.md)"
+        )
 
 
 def _closest(word: str, words: list[str]) -> str:
@@ -220,6 +239,8 @@ def _find(path: Path, mjcf: str) -> Path:
         file = path.parent / mjcf
     if not file.is_file():
         raise RobotError(f"{path}: mjcf: no such file: {file}")
+    if file.suffix.lower() == ".urdf":
+        _require_no_model(file)
     return file
 
 

@@ -16,6 +16,9 @@ from kslc_jax.robots.servos import joint_names, matching
 MAX_TILT = 0.35
 """Largest tilt [rad] of the base in the MJCF's keyframe."""
 
+TOLD_TILT = 0.01
+"""Tilt [rad] of the base in the keyframe from which users are told that it is made upright."""
+
 
 @dataclass(frozen=True, eq=False)
 class Source:
@@ -27,6 +30,7 @@ class Source:
     names: list[str]  # of these
     angles: np.ndarray  # [n] rad, home
     carrier: np.ndarray  # [nbody] the body of the new model that a body is part of; 0: none
+    straightened: float  # rad, tilt of the base in the keyframe, see `tilt`
 
     def local(self, body: int, points: np.ndarray) -> np.ndarray:
         """Points [..., 3] from the world at home to the frame of a body of the source."""
@@ -44,7 +48,7 @@ def at_home(description: Description, model: mujoco.MjModel) -> Source:
     weld = matching(description, "weld", [(p, None) for p in description.weld], names)
     welded = frozenset(hinges[i] for i, _ in weld)
     anatomy.check(model, welded)
-    qpos = _keyframe(description, model)
+    qpos, straightened = _keyframe(description, model), tilt(description, model)
     qpos[:7] = 0, 0, 0, 1, 0, 0, 0
     for i, angle in matching(description, "home", description.home, names):
         qpos[model.jnt_qposadr[hinges[i]]] = angle
@@ -61,6 +65,7 @@ def at_home(description: Description, model: mujoco.MjModel) -> Source:
         names=[names[i - 1] for i in joints],
         angles=qpos[model.jnt_qposadr[joints]],
         carrier=_carriers(model, joints),
+        straightened=straightened,
     )
 
 
@@ -73,14 +78,27 @@ def _keyframe(description: Description, model: mujoco.MjModel) -> np.ndarray:
             f" it has {', '.join(names) or 'none'}"
         )
     key = names.index(description.keyframe) if description.keyframe else 0
-    qpos = (model.key_qpos[key] if names else model.qpos0).copy()
-    _, x, y, _ = qpos[3:7] / np.linalg.norm(qpos[3:7])
-    if 1 - 2 * (x * x + y * y) < np.cos(MAX_TILT):
+    return (model.key_qpos[key] if names else model.qpos0).copy()
+
+
+def tilt(description: Description, model: mujoco.MjModel) -> float:
+    """Angle [rad] between the base's z axis and the vertical in the keyframe; 0 if it is small.
+
+    The home pose has an upright base: the angles of the base, which the policy sees and which the
+    rewards hold at 0, begin there. The joints keep the angles of the keyframe.
+
+    Raises:
+      RobotError: the base lies on its side.
+    """
+    quat = _keyframe(description, model)[3:7]
+    _, x, y, _ = quat / np.linalg.norm(quat)
+    angle = float(2 * np.arcsin(min(np.hypot(x, y), 1.0)))
+    if angle > MAX_TILT:
         raise RobotError(
             f"{description.path}: keyframe: the base lies on its side at home; its frame must have "
             "x forward and z up"
         )
-    return qpos
+    return angle if angle > TOLD_TILT else 0.0
 
 
 def _require_in_range(

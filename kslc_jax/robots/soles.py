@@ -15,6 +15,10 @@ LEVEL = 0.003
 LEVEL_SHARE = 0.5
 """Least share of the sole's length and of its width that must touch level ground."""
 
+EVEN = 0.001
+"""Height [m] up to which a point of a levelled sole touches the ground. Less than a third of the
+length of a ball, and nearly all of a flat sole, is that low; at `LEVEL` they differ little."""
+
 ROUND = 1.2
 """Length over width below which the sole points along the base."""
 
@@ -37,16 +41,17 @@ class Sole:
         }
 
 
-def find(points: np.ndarray, ankle: str, pitch: float) -> Sole:
+def find(points: np.ndarray, ankle: str, pitch: float, straightened: float = 0.0) -> Sole:
     """The sole of a foot.
 
     Args:
       points: [k, 3] on the surface of the foot's shapes, world at home [m].
       ankle: name of the joint that pitches the foot.
       pitch: sign of that joint's axis.
+      straightened: angle [rad] by which the base is tilted in the MJCF's keyframe, and not here.
 
     Raises:
-      RobotError: the foot has no shapes, or its sole is not level.
+      RobotError: the foot has no shapes, or its sole is round or not level.
     """
     if not len(points):
         raise RobotError(f"the foot below joint {ankle!r} has no shapes: add a geom as its sole")
@@ -54,17 +59,24 @@ def find(points: np.ndarray, ankle: str, pitch: float) -> Sole:
     low = points[points[:, 2] < lowest + THICKNESS]
     forward = _direction(low[:, :2])
     rotation = np.array([[forward[0], -forward[1], 0], [forward[1], forward[0], 0], [0, 0, 1]])
-    along = low @ rotation
-    lower, upper = along.min(axis=0), along.max(axis=0)
-    ground = along[along[:, 2] < lowest + LEVEL]
-    level = np.ptp(ground, axis=0)[:2] >= LEVEL_SHARE * (upper - lower)[:2]
+    along = points @ rotation
+    if not _touches(_levelled(along), EVEN).all():
+        raise RobotError(
+            f"the foot below joint {ankle!r} is round: turned in any way, it touches the ground "
+            "with a small part of its sole only; add a box as its sole to the MJCF"
+        )
+    level = _touches(along, LEVEL)
     if not level.all():
-        angle = pitch * _slope((points @ rotation)[:, [0, 2]])
+        angle = pitch * _slope(along[:, [0, 2]])
+        tilt = f" (the keyframe's base is tilted by {straightened:.2f} rad; here it is upright)"
         raise RobotError(
             f"the foot below joint {ankle!r} is not level at home: less than half of its sole is "
             f"within {1000 * LEVEL:g} mm of the ground; add {angle:+.3f} rad to that joint in "
-            "[home]" + ("" if level[1] else ", or turn the foot's roll joint")
+            "[home]"
+            + ("" if level[1] else ", or turn the foot's roll joint")
+            + (tilt if straightened else "")
         )
+    lower, upper = (low @ rotation).min(axis=0), (low @ rotation).max(axis=0)
     centre = rotation @ [*(lower + upper)[:2] / 2, lowest]
     half = (upper - lower) / 2
     return Sole(centre, rotation, float(half[0]), float(half[1]))
@@ -80,15 +92,36 @@ def _direction(points: np.ndarray) -> np.ndarray:
     return along * np.sign(along[0])
 
 
+def _touches(along: np.ndarray, height: float) -> np.ndarray:
+    """[2] bool, along and across: enough of the sole is lower than `height` [m].
+
+    Args:
+      along: [k, 3] points of the foot, in the frame of its sole [m].
+    """
+    above = along - along.min(axis=0)
+    sole, ground = (above[above[:, 2] < most, :2] for most in (THICKNESS, height))
+    return np.ptp(ground, axis=0) >= LEVEL_SHARE * np.ptp(sole, axis=0)
+
+
+def _levelled(along: np.ndarray) -> np.ndarray:
+    """Points [k, 3] of a foot, turned about y and then about x so that its sole is level."""
+    turned = along.copy()
+    for axis in (0, 1):
+        angle = _slope(turned[:, [axis, 2]])
+        cos, sin = np.cos(angle), np.sin(angle)
+        turned[:, [axis, 2]] = turned[:, [axis, 2]] @ np.array([[cos, -sin], [sin, cos]])
+    return turned
+
+
 def _slope(points: np.ndarray) -> float:
-    """Angle [rad] by which the toe is up: that of the longest edge below points [k, 2] (x, z)."""
+    """Angle [rad] by which the toe is up: that of the widest edge below points [k, 2] (x, z)."""
     hull: list[np.ndarray] = []
     for point in points[np.lexsort(points.T[::-1])]:
         while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
             hull.pop()
         hull.append(point)
     edges = np.diff(hull, axis=0)
-    x, z = edges[np.linalg.norm(edges, axis=1).argmax()]
+    x, z = edges[edges[:, 0].argmax()]
     return float(np.arctan2(z, x))
 
 
