@@ -10,6 +10,7 @@ import nbformat
 import pytest
 
 from kslc_jax import records, rewards
+from kslc_jax.robots import description
 
 ROOT = Path(__file__).parents[1]
 NAMES = ("01_quickstart", "02_train_and_evaluate", "03_rewards_and_curriculum", "04_own_robot")
@@ -134,6 +135,20 @@ def test_own_robot(execute, tmp_path, monkeypatch):
     assert pictures(notebook) == 2
     metrics = records.read_metrics(tmp_path / "runs" / "notebook-own-robot")
     assert list(metrics["step"]) == [1, 2, 3, 4]
+
+
+def test_the_notebook_adds_a_motor_to_any_description(tmp_path):
+    """Also to one that ends in another table."""
+    data = ROOT / "tests" / "data"
+    (tmp_path / "biped.xml").write_text((data / "biped.xml").read_text())
+    mine = tmp_path / "biped.toml"
+    mine.write_text((data / "biped.toml").read_text() + '[config]\n"gait.arm_swing" = 0.1')
+    (cell,) = (c for c in read("04_own_robot").cells if '"stiff.toml"' in c.source)
+    code = "\n".join(line for line in cell.source.splitlines() if not line.startswith("!"))
+    exec(code, {"ROBOT": str(mine), "PICTURES": tmp_path, "about": description.read(str(mine))})
+    stiff = description.read(str(tmp_path / "stiff.toml"))
+    assert stiff.motors[-1] == ("port_rudder|star_rudder", description.Motor(kp=24.0))
+    assert stiff.config == (("gait.arm_swing", 0.1),)
 
 
 def test_the_reward_terms_shown_are_there_and_told():
