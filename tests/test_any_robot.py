@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from packages import described
 from states import BIPED, XBOT, random_params
 
 from kslc_jax import (
@@ -428,10 +429,7 @@ def test_the_copy_of_a_robot_keeps_names_beyond_ascii(tmp_path):
 
 
 def test_the_copy_of_a_robot_in_a_package_is_its_description(tmp_path):
-    try:
-        about = description.read("unitree_g1").path
-    except RobotError as error:
-        pytest.skip(str(error))
+    about = described("unitree_g1").path
     copying.copy(str(about), tmp_path / "robot")
     assert [p.name for p in (tmp_path / "robot").iterdir()] == ["unitree_g1.toml"]
 
@@ -479,10 +477,7 @@ def test_the_runner_repeats_the_golden_trace(setup, tmp_path):
 @pytest.mark.slow(reason="each robot compiles its own train step")
 @pytest.mark.parametrize("name", sorted(description.known()))
 def test_every_shipped_robot_learns_for_two_train_steps(name):
-    try:
-        description.read(name)
-    except RobotError as error:
-        pytest.skip(str(error))
+    described(name)
     init, step = train_step.make(similar.preset("debug", name))
     first = init()
     before = jax.tree.map(np.array, first.learner.params)
