@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-from states import still_policy
+from states import BIPED, still_policy
 
 import kslc_jax.viewer
 from kslc_jax import config, files, play, robot
@@ -357,12 +357,26 @@ def test_the_panel_chooses_a_shove(viewer):
     panel._direction.value = "left"
     panel._shove_wanted.set()
     assert panel.take_shove(rng) == ("left_knee_link", panel._newtons.value, np.pi / 2)
-    panel.offer(viewer.session.links)  # the same robot: the choice stays
+    panel.offer(viewer.session.links, 1.0)  # the same robot: the choice stays
     assert panel._link.value == "left_knee_link"
-    panel.offer(("trunk", "hand"))
+    panel.offer(("trunk", "hand"), 0.5)
     assert panel._link.value == "trunk"
-    panel.offer(viewer.session.links)
+    force = panel._newtons  # of half the mass
+    assert (force.min, force.max, force.step, force.value) == (25.0, 500.0, 25.0, 100.0)
+    panel.offer(viewer.session.links, 1.0)
+    assert (force.max, force.value) == (1000.0, 200.0)
     panel._direction.value = "random"
+
+
+def test_the_camera_fits_the_size_of_the_robot(viewer):
+    from kslc_jax.viewer.figure import CAMERA
+
+    biped, shown = robot.load("high", name=BIPED), viewer.figure.robot
+    camera = viewer.server.initial_camera
+    np.testing.assert_allclose(camera.position, CAMERA)
+    viewer.figure.draw(biped)
+    np.testing.assert_allclose(camera.position, biped.length_ratio * np.array(CAMERA))
+    viewer.figure.draw(shown)
 
 
 def test_the_robot_follows_the_schedule_until_the_user_commands(viewer, monkeypatch):

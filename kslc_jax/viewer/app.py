@@ -123,7 +123,7 @@ class Viewer:
             self.figure.draw(robot)
         self.session = session
         self.session.advance()  # compiles
-        self.panel.offer(session.links)
+        self.panel.offer(session.links, robot.mass_ratio)
         self.panel.allow(float(policy.curriculum.v_max))
         self._pacer = Pacer(self.session.dt)
         shown = round(panel.PLOT_SECONDS / self.session.dt)

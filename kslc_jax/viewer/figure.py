@@ -15,7 +15,8 @@ from kslc_jax.viewer import shapes
 from kslc_jax.viewer.session import View
 
 CAMERA, LOOK_AT, FOV = (2.2, -3.0, 1.5), (0.4, 0.3, 0.75), 45.0
-"""Start position and target of the camera, relative to the robot [m]; field of view [degrees]."""
+"""Start position and target of the camera, relative to the robot [m], for XBot-L; field of view
+[degrees]."""
 
 GROUND_COLORS = ((226, 229, 233), (178, 184, 194))
 """The two colours of uneven ground: red, green, blue."""
@@ -41,8 +42,9 @@ class Figure:
         server, scene = self._server, self._server.scene
         scene.reset()
         scene.configure_environment_map("studio", environment_intensity=0.4)
-        server.initial_camera.position, server.initial_camera.look_at = CAMERA, LOOK_AT
-        server.initial_camera.fov = np.radians(FOV)
+        size, camera = robot.length_ratio, server.initial_camera
+        camera.position, camera.look_at = size * np.array(CAMERA), size * np.array(LOOK_AT)
+        camera.fov = np.radians(FOV)
         self._world = scene.add_frame("/world", show_axes=False)
         self._bodies = {}
         self._windows: list[viser.GlbHandle] = []

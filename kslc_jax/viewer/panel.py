@@ -26,8 +26,8 @@ PLOT_SECONDS = 6.0
 PLOT_HEIGHT = 130
 """Height of a plot [pixels]."""
 
-MOST_NEWTONS = 1000.0
-"""Largest force of a shove [N]."""
+NEWTONS, FIRST, MOST = 50.0, 4, 20
+"""Step of the force of a shove for XBot-L [N]; the first and the largest force, in steps."""
 
 STEP = np.array([0.25, 0.1, 0.2])
 """Change of vx, vy [m/s] and yaw rate [rad/s] per key press."""
@@ -120,7 +120,9 @@ class Panel:
             self._link = gui.add_dropdown("link", tuple(links), initial_value=links[0])
             towards = (*DIRECTIONS, RANDOM)
             self._direction = gui.add_dropdown("towards", towards, initial_value=RANDOM)
-            self._newtons = gui.add_slider("force N", 50.0, MOST_NEWTONS, 50.0, 200.0)
+            self._newtons = gui.add_slider(
+                "force N", NEWTONS, MOST * NEWTONS, NEWTONS, FIRST * NEWTONS
+            )
             shove = gui.add_button("Shove")
             shove.on_click(lambda _: self._shove_wanted.set())
 
@@ -164,10 +166,13 @@ class Panel:
         speed, _ = self._plots
         speed.scales = _scales(-MARGIN, fastest + MARGIN)
 
-    def offer(self, links: Sequence[str]) -> None:
-        """Lists the links of another robot."""
+    def offer(self, links: Sequence[str], mass_ratio: float) -> None:
+        """Lists the links of another robot, and the forces for its mass in units of XBot-L's."""
         if self._link.options != tuple(links):
             self._link.options = tuple(links)
+        force, step = self._newtons, max(round(NEWTONS * mass_ratio), 1)
+        if force.step != step:
+            force.min, force.max, force.step, force.value = step, MOST * step, step, FIRST * step
 
     def choose(self, link: str) -> None:
         """Selects a link for the next shove."""
