@@ -33,7 +33,7 @@ import tyro
 from kslc_jax import cli, files
 from kslc_jax.config import ConfigError, require_seed
 from kslc_jax.evaluation import options, tables
-from kslc_jax.evaluation.bars import Bar, bars, ranked
+from kslc_jax.evaluation.bars import HARSH, Bar, bars, ranked
 from kslc_jax.evaluation.perturbations import left_out
 from kslc_jax.evaluation.size import FULL, QUICK, Size
 
@@ -164,7 +164,7 @@ def _report(args: Args, path: Path) -> None:
     from rich.progress import Progress
 
     from kslc_jax import physics, similar
-    from kslc_jax.evaluation import judging, trials
+    from kslc_jax.evaluation import judging, trials, variation
     from kslc_jax.policy import load_policy, policy_name
 
     files.require_writable(args.json)
@@ -188,7 +188,9 @@ def _report(args: Args, path: Path) -> None:
             keep(found)
 
     screen = tables.console()
-    if missing := left_out(args.size.perturbations, size.perturbations):
+    harsh = tuple(HARSH) if args.harsh else ()
+    tried = *size.perturbations, *variation.for_robot(harsh, robot)
+    if missing := left_out((*args.size.perturbations, *harsh), tried):
         screen.print(missing)
     with Progress(console=screen, transient=True, speed_estimate_period=600) as bar:
         tasks = {name: bar.add_task(name, total=1.0, start=False) for name in names}

@@ -5,8 +5,9 @@ import json
 from pathlib import Path
 
 import pytest
+from states import BIPED, random_params
 
-from kslc_jax import config, judge, robot
+from kslc_jax import config, curriculum, judge, robot, similar
 from kslc_jax import policy as policy_lib
 from kslc_jax.evaluation import judging, scheduled, tables, variation
 from kslc_jax.evaluation import measure as measuring
@@ -227,6 +228,22 @@ def test_the_command_keeps_and_shows_what_it_measured(monkeypatch, tmp_path, cap
     kept = json.loads(out.read_text())
     assert len(kept["bars"]) == 13 and kept["size"]["seeds"] == FULL.seeds
     assert len(kept["perturbed"]) == 16 and len(kept["schedules"]) == 4
+
+
+def test_harsh_conditions_that_a_robot_lacks_are_named(monkeypatch, capsys):
+    """The biped has no arms: nobody holds them, and they carry nothing."""
+
+    def measure(policy, setting, speeds, seeds, seed, progress, describe=None):
+        return [row(speed) for speed in speeds]
+
+    monkeypatch.setattr(measuring, "measure", measure)
+    monkeypatch.setattr(scheduled, "measure", lambda *args: [])
+    debug = similar.preset("debug", BIPED)
+    policy = policy_lib.Policy(debug, random_params(debug), curriculum.init(debug), 0)
+    monkeypatch.setattr(policy_lib, "load_policy", lambda path: policy)
+    for option, said in ([], "lacks it: hands "), (["--harsh"], "lacks it: hands, arms "):
+        assert judge.main(["biped", *option]) == 0
+        assert said in " ".join(capsys.readouterr().out.split())
 
 
 def test_the_robots_of_the_schedules_differ_in_more_than_their_base():

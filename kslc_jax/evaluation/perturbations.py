@@ -6,6 +6,7 @@ arguments quickly.
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -95,9 +96,9 @@ def scaled(condition: str, factors: dict[str, float]) -> str:
 
 
 def left_out(wanted: Sequence[str], tried: Sequence[str]) -> str:
-    """A message that names the perturbations that are wanted but not tried; empty without any."""
-    there = {condition.partition("=")[0] for condition in tried}
-    names = dict.fromkeys(condition.partition("=")[0] for condition in wanted)
+    """A message that names the conditions that are wanted but not tried; empty without any."""
+    there = {re.split("[=:]", condition)[0] for condition in tried}
+    names = dict.fromkeys(re.split("[=:]", condition)[0] for condition in wanted)
     missing = ", ".join(name for name in names if name not in there)
     return f"left out, because robot or engine lacks it: {missing}" if missing else ""
 
