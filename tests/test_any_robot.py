@@ -1,6 +1,7 @@
 """The package with another robot: the biped of tests/data, without arms and with other names."""
 
 import copy
+import ctypes.util
 import dataclasses
 import json
 import os
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from family import COMMANDS, main
 from packages import described
 from states import BIPED, XBOT, random_params
 
@@ -654,12 +656,83 @@ def test_a_robot_is_chosen_by_its_own_option(capsys):
     assert train.parse(words).config == wanted
 
 
-@pytest.mark.slow(reason="compiles a train step: a minute")
-def test_the_biped_trains_and_resumes(tmp_path):
-    run = ["--run-dir", str(tmp_path), "--steps"]
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory) -> Path:
+    """The run folder of a training of the biped that was resumed."""
+    folder = tmp_path_factory.mktemp("runs") / "biped-seed0"
+    run = ["--run-dir", str(folder), "--steps"]
     assert train.main(["--robot", BIPED, "--preset", "debug", *run, "256"]) == 0
     assert train.main(["--resume", *run, "512"]) == 0
-    assert policy.load_policy(tmp_path).step == 4
+    return folder
+
+
+@pytest.mark.slow(reason="compiles a train step: a minute")
+def test_the_biped_trains_and_resumes(trained):
+    assert policy.load_policy(trained).step == 4
+
+
+SHORT = "--seeds 1 --seconds 3"
+ONE = f"--speeds 0.3 {SHORT}"
+LINES = {
+    "evaluate": (
+        f"evaluate RUN {ONE} --json OUT/found.json",
+        "plots performance OUT/found.json --out OUT/performance.png",
+        "plots momentum OUT/found.json --out OUT/momentum.png",
+    ),
+    "learning": (f"learning RUN {ONE}", "plots learning RUN --out OUT/learning.png"),
+    "judge": (f"judge RUN --quick {SHORT} --json OUT/judged.json", "judge OUT/judged.json"),
+    "falls": ("falls RUN --robots 16 --seconds 3 --json OUT/falls.json",),
+    "sim2sim": (
+        f"sim2sim RUN {ONE} --perturb payload=1 --json OUT/found.json",
+        "plots conditions OUT/found.json --out OUT/conditions.png",
+    ),
+    "sim2sim --schedule": (
+        f"sim2sim RUN --schedule stop {SHORT} --json OUT/found.json",
+        "plots schedules OUT/found.json --out OUT/schedules.png",
+    ),
+    "export": (
+        "export RUN OUT/policy.onnx",
+        "export RUN OUT/policy --format orbax",
+        f"evaluate OUT/policy {ONE} --fidelity high",
+    ),
+    "plots": ("plots training RUN --out OUT/training.png",),
+}
+"""Lines of commands that a user of another robot types. RUN is a run folder, OUT a new one."""
+
+
+def test_all_commands_that_take_a_policy_are_tried():
+    tried = {line.split()[0] for lines in LINES.values() for line in lines}
+    assert tried == {*COMMANDS} - {"compare", "doctor", "play", "reproduce", "train"}
+
+
+@pytest.mark.slow(reason="compiles a train step, and one or more trials for each: minutes")
+@pytest.mark.parametrize("name", LINES)
+def test_every_command_takes_the_biped(trained, tmp_path, name):
+    for line in LINES[name]:
+        words = line.replace("RUN", str(trained)).replace("OUT", str(tmp_path)).split()
+        assert main(words[0])(words[1:]) == 0, line
+        written = [Path(word) for word in words if word.startswith(str(tmp_path))]
+        assert all(path.exists() for path in written), line
+
+
+@pytest.mark.slow(reason="a process of its own, in which GL is chosen before MuJoCo is imported")
+def test_the_biped_is_filmed(trained, tmp_path):
+    strip, film = tmp_path / "strip.png", tmp_path / "film.webp"
+    words = f"--speeds 0.3 --seconds 0.5 --gait-strip {strip} --video {film}".split()
+    if not any(map(ctypes.util.find_library, ("EGL", "OSMesa"))):
+        pytest.skip("no off-screen GL")
+    command = [sys.executable, "-m", "kslc_jax.play", str(trained), *words]
+    env = {k: v for k, v in os.environ.items() if k != "MUJOCO_GL"}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
+    assert done.returncode == 0, done.stderr
+    assert strip.stat().st_size > 5_000 and film.stat().st_size > 5_000
+
+
+@pytest.mark.slow(reason="compiles a train step: a minute")
+def test_a_training_has_no_published_numbers(trained, capsys):
+    assert main("reproduce")([str(trained)]) == 2
+    said = capsys.readouterr().err.strip()
+    assert "only shipped policies have published numbers: xbot_l_run" in said and "\n" not in said
 
 
 def test_compare_takes_a_robot(tmp_path):

@@ -572,7 +572,7 @@ class TestReproduce:
         assert "seed" in refused(reproduce.main, "--seed", seed)
 
     def test_not_a_shipped_one(self, policy):
-        assert "evaluation.json" in refused(reproduce.main, policy)
+        assert "only shipped policies" in refused(reproduce.main, policy)
 
 
 class TestPlots:
