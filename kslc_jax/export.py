@@ -13,10 +13,11 @@ POLICY is a run folder, a checkpoint folder, or the name of a shipped policy.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
@@ -212,7 +213,22 @@ def to_stablehlo(policy: Policy) -> bytes:
     (batch,) = jax.export.symbolic_shape("batch")
     shape = (batch, *policy.init().history.shape)
     export = jax.export.export(jax.jit(jax.vmap(policy.act_on)), platforms=("cpu", "cuda", "tpu"))
-    return bytes(export(jax.ShapeDtypeStruct(shape, jnp.float32)).serialize())
+    with _without_folders():
+        return bytes(export(jax.ShapeDtypeStruct(shape, jnp.float32)).serialize())
+
+
+@contextlib.contextmanager
+def _without_folders() -> Generator[None]:
+    """JAX notes the source line of each operation; here without the folders of this machine."""
+    import jax
+
+    name = "jax_hlo_source_file_canonicalization_regex"
+    before = getattr(jax.config, name)
+    jax.config.update(name, ".*/")
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
 
 
 def read_stablehlo(path: Path) -> Network:

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import jax
@@ -216,10 +217,34 @@ def saved(symmetric, tmp_path_factory):
     return folder
 
 
-def test_a_stored_policy_names_no_folder(saved):
-    paths = [path for path in saved.rglob("*") if path.is_file()]
-    assert len(paths) > 5
-    assert not [path for path in paths if str(saved.parent).encode() in path.read_bytes()]
+@pytest.fixture(scope="module")
+def contracted(acting, tmp_path_factory):
+    """The exported file with its data, robot and a golden trace of a second beside it."""
+    onnx_file = tmp_path_factory.mktemp("contract") / "policy.onnx"
+    onnx_file.write_bytes(export.to_onnx(acting))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(contract, "golden", functools.partial(contract.golden, seconds=1.0))
+        written = contract.write(acting, onnx_file)
+    assert [path.name for path in written] == ["policy.json", "policy.xml", "policy.npz"]
+    return onnx_file
+
+
+def test_no_exported_file_names_a_folder(symmetric, saved, contracted):
+    """Not the package's, nor that of Python and its packages, of the temporary files, of the user.
+    StableHLO keeps the names of the source files."""
+    stablehlo = export.to_stablehlo(symmetric)
+    assert b"networks.py" in stablehlo and b"/networks.py" not in stablehlo
+    stored = [path for path in saved.rglob("*") if path.is_file()]
+    beside = [contracted.with_suffix(x) for x in (".onnx", ".json", ".xml", ".npz")]
+    assert len(stored) > 5
+    found = {path: path.read_bytes() for path in stored + beside} | {"stablehlo": stablehlo}
+    trace = np.load(contracted.with_suffix(".npz"))
+    assert all(trace[name].dtype.kind in "fi" for name in trace)  # numbers; the file is packed
+    package = Path(export.__file__).parents[1]
+    private = {package, sys.prefix, Path(jax.__file__).parents[1], saved.parent, contracted.parent}
+    private |= {Path.home(), Path(tempfile.gettempdir())}
+    for where, content in found.items():
+        assert not [folder for folder in private if f"{folder}/".encode() in content], where
 
 
 def test_a_policy_folder_is_the_whole_policy(symmetric, saved):
@@ -353,18 +378,6 @@ def checker():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.fixture(scope="module")
-def contracted(acting, tmp_path_factory):
-    """The exported file with its data, robot and a golden trace of a second beside it."""
-    onnx_file = tmp_path_factory.mktemp("contract") / "policy.onnx"
-    onnx_file.write_bytes(export.to_onnx(acting))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(contract, "golden", functools.partial(contract.golden, seconds=1.0))
-        written = contract.write(acting, onnx_file)
-    assert [path.name for path in written] == ["policy.json", "policy.xml", "policy.npz"]
-    return onnx_file
 
 
 def test_a_golden_trace_is_what_its_policy_does(acting, contracted):
