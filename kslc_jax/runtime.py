@@ -150,7 +150,15 @@ def own_numerics() -> Generator[None]:
             before = {name: _read_as(text, NUMERICS[name]) for name, text in texts.items()}
         for name, value in before.items():
             if jax and name in jax.config.values:
-                jax.config.update(name, value)
+                _set(jax.config, name, value)
+
+
+def _set(options: Any, name: str, value: Value) -> None:
+    """Sets an option in `jax.config`. A value that JAX cannot read changes nothing."""
+    if isinstance(value, str) and isinstance(NUMERICS[name], bool):
+        return  # JAX would take any text for True
+    with contextlib.suppress(ValueError):
+        options.update(name, value)
 
 
 def _means(text: str, value: Value) -> bool:
@@ -159,9 +167,12 @@ def _means(text: str, value: Value) -> bool:
 
 
 def _read_as(text: str, like: Value) -> Value:
-    """What JAX reads from `text` in the environment, for an option whose default is `like`."""
+    """What JAX reads from `text` in the environment, for an option whose default is `like`.
+
+    A text that it cannot read stays a text.
+    """
     if isinstance(like, bool):
-        return text.lower() in _YES if text.lower() in _YES + _NO else not like
+        return text.lower() in _YES if text.lower() in _YES + _NO else text
     if isinstance(like, int | float):
         with contextlib.suppress(ValueError):
             return type(like)(text)

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import io
 import os
+import select
 import sys
 from collections.abc import Generator
 from typing import Any, TextIO
@@ -19,9 +20,15 @@ class _Sink(io.FileIO):
     """First error that lost output although it had a reader, such as a full disk."""
 
     def write(self, data: Any, /) -> int:
-        """Writes or discards the data; returns the number of bytes."""
+        """Writes or discards the data; returns the number of bytes.
+
+        At a pipe that is full it waits for the reader, as a blocking pipe does, also if another
+        program has made the pipe a non-blocking one.
+        """
         try:
-            return super().write(data)
+            while (written := super().write(data)) is None:
+                select.select([], [self], [])
+            return written
         except OSError as error:
             if error.errno not in GONE:
                 self.failure = self.failure or error

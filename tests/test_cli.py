@@ -296,6 +296,20 @@ def test_options_of_a_jax_that_is_there_already_are_overridden_too(capsys):
             jax.config.update(name, value)
 
 
+def test_variables_that_jax_cannot_read_end_no_command(monkeypatch, capsys):
+    """JAX would refuse them at its import; here the command imports it without them."""
+    wrong = dict.fromkeys(runtime.NUMERICS, "junk")
+    for name, value in wrong.items():
+        monkeypatch.setenv(name.upper(), value)
+    monkeypatch.delitem(sys.modules, "jax")
+    assert cli.run(lambda: sys.modules.update(jax=jax)) == 0
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and all(f"{name.upper()}=junk" in said for name in wrong)
+    assert {name: os.environ[name.upper()] for name in wrong} == wrong  # the user's, as before
+    options = {n: runtime._option(jax.config, n, x) for n, x in runtime.NUMERICS.items()}
+    assert options == runtime.NUMERICS
+
+
 def test_variables_of_a_notebook_count_again_after_a_command():
     """Also if the command is the first that imports JAX."""
     code = (

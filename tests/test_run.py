@@ -442,6 +442,39 @@ def test_git_is_not_needed(monkeypatch):
     assert versions["git"] == "unknown" and versions["kslc_jax"] == kslc_jax.__version__
 
 
+def test_an_edited_checkout_has_another_digest(tmp_path):
+    """Two edited checkouts of one commit are both called `-dirty`."""
+    (tmp_path / "part").mkdir()
+    one, two = tmp_path / "a.py", tmp_path / "part" / "b.py"
+    digests = []
+    for path, text in ((one, "x = 1"), (two, "y = 1"), (two, "y = 2"), (one, "x = 2")):
+        path.write_text(text)
+        digests.append(run_folder._digest(tmp_path))
+    one.rename(tmp_path / "c.py")
+    digests.append(run_folder._digest(tmp_path))
+    (tmp_path / "notes.txt").touch()
+    assert len(set(digests)) == 5 and run_folder._digest(tmp_path) == digests[-1]
+    ours = run_folder.versions()["code"]
+    assert ours == run_folder._digest(Path(kslc_jax.__file__).parent)
+    (tmp_path / files.VERSIONS).write_text('{"code": "before"}')
+    said = run_folder.what_changed(tmp_path, {"code": ours, "jax": "of no run before"})
+    assert said == f"with code {ours} instead of before (bits may differ from here)"
+
+
+def test_versions_keep_variables_without_their_paths(monkeypatch):
+    """`XLA_FLAGS` may also be the name of a file with flags."""
+    kept = "--xla_a=2 --xla_b='x y' --xla_c=PATH --xla_d=PATH --xla_e=z PATH"
+    text = kept
+    for path in ("/home/" + "me/dump", '"my folder/dump"', "./flags"):
+        text = text.replace("PATH", path, 1)
+    monkeypatch.setenv("XLA_FLAGS", text)
+    monkeypatch.setenv("NVIDIA_TF32_OVERRIDE", "0")
+    versions = run_folder.versions()
+    assert versions["XLA_FLAGS"] == kept and versions["NVIDIA_TF32_OVERRIDE"] == "0"
+    monkeypatch.delenv("XLA_FLAGS")
+    assert run_folder.versions()["XLA_FLAGS"] == ""
+
+
 def git(folder: Path, *command: str) -> str:
     who = ("-c", "user.name=somebody", "-c", "user.email=somebody@example.org")
     argv = ["git", "-C", str(folder), *who, *command]

@@ -1,10 +1,12 @@
 """Commands whose output is closed or cannot be written."""
 
+import concurrent.futures
 import contextlib
 import io
 import os
 import subprocess
 import sys
+import time
 
 import family
 import pytest
@@ -41,6 +43,26 @@ def test_a_command_goes_on_without_its_reader(closed):
     before = sys.stdout
     assert cli.run(work) == 3 and done
     assert sys.stdout is before
+
+
+def test_a_full_pipe_that_does_not_block_is_waited_for(monkeypatch):
+    """Programs such as ssh and node make the pipes and terminals of their children so."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    stream = io.TextIOWrapper(io.FileIO(writer, "w"))
+    monkeypatch.setattr(sys, "stdout", stream)
+    monkeypatch.setattr(sys, "__stdout__", stream)
+    lines, read = [f"{i:0100}\n" for i in range(5000)], []
+
+    def slow():
+        time.sleep(0.1)
+        with open(reader) as file:
+            read.extend(file)
+
+    with concurrent.futures.ThreadPoolExecutor(1) as other, stream:
+        other.submit(slow)
+        assert cli.run(lambda: print("".join(lines), end="")) == 0
+    assert read == lines
 
 
 @pytest.fixture

@@ -2,10 +2,12 @@
 
 import contextlib
 import fcntl
+import hashlib
 import importlib.metadata
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 from collections.abc import Generator
@@ -28,6 +30,12 @@ from kslc_jax.training.logs import rows_written
 
 PACKAGES = ("jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
+VARIABLES = ("XLA_FLAGS", "NVIDIA_TF32_OVERRIDE")
+"""Environment variables that change the bits of a result."""
+
+_PATH = re.compile(r"""(?<==)(["'])[^"']*/[^"']*\1|[^\s=]*/\S*""")
+"""A path in the text of a variable, in quotes or without."""
+
 
 class RunError(UserError, RuntimeError):
     """A run folder cannot be used. The message gives the reason and a way out."""
@@ -36,18 +44,21 @@ class RunError(UserError, RuntimeError):
 def versions() -> dict[str, str]:
     """Versions of software and hardware that the bits of a result depend on.
 
-    `git` is the commit of this package's own checkout, or "unknown" if it runs from none.
+    `git` is the commit of this package's own checkout, or "unknown" if it runs from none. `code` is
+    a digest of its Python files: two edited checkouts of one commit differ in it.
     """
+    package = Path(__file__).parents[1]
     found = {name: importlib.metadata.version(name) for name in PACKAGES}
     found |= {d.name: d.version for d in importlib.metadata.distributions(name="jax-cuda12-plugin")}
     return {
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpu": processors.model(),
-        "XLA_FLAGS": os.environ.get("XLA_FLAGS", ""),
+        **{name: _PATH.sub("PATH", os.environ.get(name, "")) for name in VARIABLES},
         "device": str(jax.devices()[0].device_kind),
         "kslc_jax": __version__,
         "git": _revision(Path(__file__)) or "unknown",
+        "code": _digest(package),
         **found,
     }
 
@@ -66,6 +77,14 @@ def _revision(module: Path) -> str:
     if not _git(package, "ls-files", "--", str(module.resolve())):
         return ""
     return _git(package, "describe", "--always", "--dirty")
+
+
+def _digest(package: Path) -> str:
+    """Beginning of a SHA-256 of the names and texts of all Python files in a folder."""
+    found = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        found.update(f"{path.relative_to(package)}\n".encode() + path.read_bytes())
+    return found.hexdigest()[:12]
 
 
 def _git(folder: Path, *command: str) -> str:
