@@ -188,7 +188,9 @@ def opened(
         open_folder(run_dir, config, resume, facts)
         with writing(run_dir):
             store = stack.enter_context(contextlib.closing(storage.open(run_dir, config)))
-        online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if wandb else None
+        over = max(store.steps(), default=0) >= config.num_updates  # a resume does nothing then
+        send = wandb and not over
+        online = wandb_run.wandb_run(config, run_dir, resume, progress.warn) if send else None
         run = stack.enter_context(online) if online else None
         begin = functools.partial(note_resume, run_dir, config, facts)
         yield Recorder(config, run_dir, store, progress, storage.save_policy, run, begin)

@@ -40,7 +40,8 @@ class WandbRun:
     def write(self, record: dict[str, float]) -> None:
         """Sends the finite values of a record. Only the first failure calls `warn`."""
         try:
-            self._run.log(finite_values(record), step=int(record["step"]))
+            # Without `step`: wandb ignores a step that does not grow, as after going back.
+            self._run.log(finite_values(record))
         except Exception as error:  # network, disk, or a bug of the package
             if not self._failed:
                 self._warn(f"cannot write to wandb ({first_line(error)}); training goes on")
