@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 import numpy as np
 import tyro
 
-from kslc_jax import __version__, cli, contract, files
+from kslc_jax import __version__, cli, contract, files, processors
 from kslc_jax.config import Config, ConfigError
 
 if TYPE_CHECKING:
@@ -197,7 +197,9 @@ def read_onnx(path: Path) -> Network:
     """The network of an ONNX file, run by onnxruntime; ImportError if that is missing."""
     import onnxruntime
 
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    options, on = onnxruntime.SessionOptions(), ["CPUExecutionProvider"]
+    options.intra_op_num_threads = processors.usable()  # it knows no quota
+    session = onnxruntime.InferenceSession(str(path), options, providers=on)
     return lambda histories: np.asarray(session.run(["action"], {"history": histories})[0])
 
 

@@ -18,6 +18,7 @@ Examples:
 """
 
 import argparse
+import contextlib
 import dataclasses
 import re
 import sys
@@ -114,8 +115,11 @@ def cluster(
     """The arguments of `devices.join` from three options; ConfigError if these do not match."""
     if (coordinator, processes, index) == ("auto", None, None):
         return None, None, None
-    counts = [int(c) for c in (processes, index) if c is not None and c.isdecimal()]
-    if len(counts) < 2 or not re.fullmatch(r"\S+:\d{1,5}", coordinator or ""):
+    counts = []
+    for text in filter(None, (processes, index)):
+        with contextlib.suppress(ValueError):
+            counts.append(cli.whole_number(text))
+    if min(counts, default=-1) < 0 or len(counts) < 2 or not re.fullmatch(r"\S+:\d{1,5}", coordinator or ""):
         raise ConfigError(
             "several processes need --coordinator host:port, --processes N and --process-index I, "
             "or --coordinator auto alone"

@@ -157,6 +157,7 @@ class TestTrain:
         assert "--coordinator host:port, --processes N" in self.refused(run_dir, *options)
 
     def test_processes_that_cannot_be(self, run_dir):
+        assert train.cluster("localhost:1234", "2e0", "1_0e-1") == ("localhost:1234", 2, 1)
         where = ("--coordinator", "localhost:1234", "--processes", 2, "--process-index", 2)
         assert "--process-index: 2 is too large" in self.refused(run_dir, *where)
         assert "--coordinator auto, with the scheduler's settings: cannot join" in self.refused(

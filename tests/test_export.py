@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import slow
 from states import ACTOR, MIRROR, XBOT
@@ -126,6 +127,16 @@ def test_the_file_acts_as_the_policy(policy, form, tmp_path):
         assert got.shape == (batch, 16) and got.dtype == np.float32
         np.testing.assert_allclose(got, wanted, atol=2e-6)
         assert np.abs(wanted).max() > 0.3
+
+
+def test_onnxruntime_gets_the_processors_that_are_allowed(onnx_file, monkeypatch):
+    opened, seen = onnxruntime.InferenceSession, []
+    monkeypatch.setattr(export.processors, "usable", lambda: 3)
+    monkeypatch.setattr(
+        onnxruntime, "InferenceSession", lambda *how, **on: seen.append(opened(*how, **on))
+    )
+    export.read_onnx(onnx_file)
+    assert seen[0].get_session_options().intra_op_num_threads == 3
 
 
 def test_the_symmetric_actor_as_a_plain_mlp_mirrors(symmetric, tmp_path):

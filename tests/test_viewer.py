@@ -514,6 +514,40 @@ def test_following_waits_for_the_first_checkpoint(training, capsys, monkeypatch)
     assert len(naps) == 3 and capsys.readouterr().out.count("waiting for the first") == 1
 
 
+def test_following_waits_for_the_training(training, tmp_path, capsys, monkeypatch):
+    """So that its command and that of the training can be pasted together."""
+    run_dir, naps = tmp_path / "runs" / "mine", []
+
+    def sleep(seconds):
+        naps.append(seconds)
+        if len(naps) == 2:  # the lock comes before the config
+            run_dir.mkdir(parents=True)
+            (run_dir / files.LOCK).touch()
+        if len(naps) == 4:
+            shutil.copytree(training.folder, run_dir, dirs_exist_ok=True)
+
+    monkeypatch.setattr(following, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(following.time, "sleep", sleep)
+    assert following.Follower(run_dir).wait() == run_dir / files.CHECKPOINTS / "10"
+    said = f"waiting for the first checkpoint in {run_dir}; no training has begun there yet\n"
+    assert len(naps) == 4 and capsys.readouterr().out == said
+
+
+def test_following_does_not_wait_for_several_seeds(tmp_path, monkeypatch):
+    run_dir = tmp_path / "mine"
+
+    def sleep(seconds):
+        (run_dir / "seed-3").mkdir(parents=True)
+        (run_dir / "seed-3" / files.CONFIG).touch()
+
+    monkeypatch.setattr(following.time, "sleep", sleep)
+    with pytest.raises(ConfigError, match="several trainings, name one: .*/mine/seed-3$"):
+        following.Follower(run_dir).wait()
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="file is no run folder of a training"):
+        following.Follower(tmp_path / "file")
+
+
 def test_the_robot_goes_on_with_a_newer_policy(viewer, training, monkeypatch):
     monkeypatch.setattr(viewer, "_follower", following.Follower(training.folder))
     viewer.panel.policy.value = viewer._given

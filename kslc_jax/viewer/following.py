@@ -5,8 +5,9 @@ import time
 from pathlib import Path
 
 from kslc_jax import files
-from kslc_jax.checkpoint_format import has_checkpoints, whole_checkpoints
+from kslc_jax.checkpoint_format import CheckpointError, has_checkpoints, whole_checkpoints
 from kslc_jax.config import ConfigError
+from kslc_jax.policy import checkpoint_folder
 
 LOOK_SECONDS = 1.0
 """Time [s] between two looks into the run folder."""
@@ -22,25 +23,46 @@ def newest(run_dir: Path) -> Path | None:
     return max(found, key=lambda p: (int(p.name), p.parent.name == files.SNAPSHOTS), default=None)
 
 
+def _is_policy(path: Path) -> bool:
+    """True if `load_policy` finds a policy there."""
+    try:
+        checkpoint_folder(path)
+    except CheckpointError:
+        return False
+    return True
+
+
 class Follower:
     """Returns each new policy of one run folder once."""
 
     def __init__(self, run_dir: Path):
-        """ConfigError if the folder is no run folder of a training."""
-        if not (run_dir / files.CONFIG).is_file():
-            raise ConfigError(
-                f"--follow: {run_dir} is no run folder of a training (no {files.CONFIG})"
-                f"{files.seeds_hint(run_dir)}"
-            )
+        """ConfigError if the path cannot become the run folder of a training, see `_begun`."""
         self._run_dir = run_dir
         self._seen: Path | None = None
         self._looked = -math.inf
+        self._begun()
+
+    def _begun(self) -> bool:
+        """True if the training has begun, False if it may still begin.
+
+        ConfigError if the path is something else: a policy, a file, the folder of several seeds.
+        """
+        if (self._run_dir / files.CONFIG).is_file():
+            return True
+        if self._run_dir.is_file() or files.seeds_in(self._run_dir) or _is_policy(self._run_dir):
+            raise ConfigError(
+                f"--follow: {self._run_dir} is no run folder of a training (no {files.CONFIG})"
+                f"{files.seeds_hint(self._run_dir)}"
+            )
+        return False
 
     def wait(self) -> Path:
-        """The folder of the newest policy. Waits if there is none yet."""
+        """The folder of the newest policy. Waits for the training and for its first checkpoint."""
         if newest(self._run_dir) is None:
-            print(f"waiting for the first checkpoint in {self._run_dir}", flush=True)
+            yet = "" if self._begun() else "; no training has begun there yet"
+            print(f"waiting for the first checkpoint in {self._run_dir}{yet}", flush=True)
         while (path := self.fresh(time.monotonic())) is None:
+            self._begun()
             time.sleep(LOOK_SECONDS)
         return path
 
