@@ -6,6 +6,7 @@ python examples/onnx_runner.py policy.onnx --vx 1.0 --seconds 10
 """
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -33,6 +34,7 @@ class Controller:
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
         self.wanted = self.velocity = np.zeros(2)
+        self.heading, self.turns = heading, True
         self.phase = 0.0
         self.command(vx, vy, heading)
         self.free = np.array([name not in m.held_joints for name in m.joint_names])
@@ -43,12 +45,15 @@ class Controller:
         """Sets the command: vx, vy [m/s], heading [rad].
 
         Walking begins above the dead zone and ends below 0.9 times it. So a trembling joystick at
-        the edge of the dead zone does not start and stop the robot.
+        the edge of the dead zone does not start and stop the robot. While a command holds, a turn
+        on the spot that has ended does not begin again; a new command may begin one.
         """
+        before = *self.wanted, self.heading
         speed, edge = np.hypot(vx, vy), self.meta.command.dead_zone
         walks = speed > (STOP if self.wanted.any() else 1) * edge
         self.wanted = np.array([vx, vy]) * max(edge / speed, 1) if walks else np.zeros(2)
         self.heading = heading
+        self.turns |= (*self.wanted, heading) != before
         self.approach(0.0)
 
     def approach(self, dt):
@@ -70,7 +75,8 @@ class Controller:
         rate = m.command.heading_gain * ((self.heading - yaw + np.pi) % (2 * np.pi) - np.pi)
         rate = np.clip(rate, -m.command.max_yaw_rate, m.command.max_yaw_rate)
         walks = self.wanted.any() or self.velocity.any()
-        moving = not m.command.stand_still or walks or abs(rate) > m.command.turning
+        self.turns &= abs(rate) > m.command.turning
+        moving = not m.command.stand_still or walks or self.turns
         angle = 2 * np.pi * self.phase
         offset = joint_pos - np.array(m.default_joint_pos)
         values = dict(joint_pos=offset, joint_vel=joint_vel, last_action=self.action)
@@ -125,6 +131,26 @@ def steps_per_control(control_dt, timestep):
     return steps
 
 
+def difference(m, model):
+    """How the robot of a model differs from the policy's, whose metadata are `m`; None if equal.
+
+    The joints, and the servos that drive them, must have the policy's order and gains.
+    """
+    joints = [model.joint(i).name for i in range(model.njnt)][1:]  # the first one is the base's
+    kinds = zip(model.actuator_trntype, model.actuator_trnid[:, 0], strict=True)
+    driven = [model.joint(i).name if k == mujoco.mjtTrn.mjTRN_JOINT else None for k, i in kinds]
+    for what, names in (("joint", joints), ("the joint of actuator", driven)):
+        for i, (found, wanted) in enumerate(itertools.zip_longest(names, m.joint_names)):
+            if found != wanted:
+                return f"{what} {i} is {found}, not {wanted}"
+    gains = np.stack([model.actuator_gainprm[:, 0], -model.actuator_biasprm[:, 1]])
+    wrong = ~np.isclose(gains, m.kp, rtol=1e-4)  # an exported MJCF has six digits
+    if not wrong.any():
+        return None
+    row, i = np.argwhere(wrong)[0]
+    return f"the gain of {m.joint_names[i]} is {gains[row, i]:g}, not {m.kp[i]:g}"
+
+
 def simulate(controller, model, seconds):
     """Base positions [T, 3, m] at each control step, until the time ends or the robot falls."""
     m, data = controller.meta, mujoco.MjData(model)
@@ -156,6 +182,8 @@ if __name__ == "__main__":
         if not path.is_file():
             parser.error(f"no file '{path}'")
     model, controller = mujoco.MjModel.from_xml_path(str(mjcf)), Controller(args.policy, args.vx)
+    if found := difference(controller.meta, model):
+        parser.exit(2, f"error: {mjcf} is not the robot of {args.policy}: {found}\n")
     model.opt.timestep = 0.001  # with 5 ms the motors cannot keep a shank within its speed limit
     track, dt = simulate(controller, model, args.seconds), controller.meta.control_dt
     speed = np.diff(track[len(track) // 2 :, 0]).mean() / dt

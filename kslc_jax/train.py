@@ -119,7 +119,8 @@ def cluster(
     for text in filter(None, (processes, index)):
         with contextlib.suppress(ValueError):
             counts.append(cli.whole_number(text))
-    if min(counts, default=-1) < 0 or len(counts) < 2 or not re.fullmatch(r"\S+:\d{1,5}", coordinator or ""):
+    who = len(counts) == 2 and min(counts) >= 0
+    if not (who and re.fullmatch(r"\S+:\d{1,5}", coordinator or "")):
         raise ConfigError(
             "several processes need --coordinator host:port, --processes N and --process-index I, "
             "or --coordinator auto alone"

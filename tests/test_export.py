@@ -6,6 +6,7 @@ import functools
 import importlib.util
 import json
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -491,6 +492,57 @@ def test_the_runner_walks_on_at_the_edge_of_the_dead_zone(runner, onnx_file):
         controller.command(vx)
         seen.append(round(float(controller.wanted[0]), 3))
     assert seen == [0.21, 0.2, -0.2, 0.0, 0.0]
+
+
+def test_the_runner_does_not_turn_back_and_forth_while_it_stands(runner, onnx_file):
+    """A turn on the spot begins above 0.1 rad/s, 0.2 rad from the heading. Once it has ended it
+    begins again only with another command, as in training."""
+    controller = runner.Controller(onnx_file, 0.0, heading=0.3)
+    command = controller.meta.command
+    assert (command.turning, command.heading_gain) == (0.1, 0.5)
+
+    def turns(yaw):
+        quat = np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+        return controller.frame(quat, np.zeros(3), np.zeros(16), np.zeros(16))[4] != 0.0
+
+    marches = not command.stand_still  # and shows its yaw rate at any time
+    turned = [turns(yaw) for yaw in (0.0, 0.05, 0.11, 0.05, -0.5)]
+    assert turned == [True, True, marches, marches, marches]
+    controller.command(0.0, heading=0.3)  # the same as before
+    assert turns(-0.5) == marches
+    controller.command(0.0, heading=0.31)
+    assert turns(-0.5) and turns(0.0)
+
+
+def test_the_runner_refuses_another_robot(runner, policy, onnx_file, tmp_path, capsys, monkeypatch):
+    """Its MJCF has another order of joints or servos, other joints or other gains."""
+    text = contract.mjcf(policy)
+    line = {name: re.search(f'<general name="{name}".*\n', text)[0] for name in XBOT.joint_names}
+    knee, yaw = line["left_knee_joint"], line["left_leg_yaw_joint"]
+    assert 'gainprm="350" biasprm="0 -350 ' in knee
+    swapped = text.replace(knee, "KNEE").replace(yaw, knee).replace("KNEE", yaw)
+    meta = runner.SimpleNamespace(**contract.metadata(policy))
+    for changed, says in (
+        (text, None),
+        (swapped, "the joint of actuator 1 is left_knee_joint, not left_leg_yaw_joint"),
+        (text.replace(yaw, ""), "the joint of actuator 1 is left_leg_pitch_joint, not left_leg_y"),
+        (
+            text.replace("left_knee_joint", "left_knee"),
+            "joint 3 is left_knee, not left_knee_joint",
+        ),
+        (text.replace(knee, knee.replace("350", "700")), "the gain of left_knee_joint is 700, not"),
+        (text.replace(knee, knee.replace("-350", "-70")), "the gain of left_knee_joint is 70, not"),
+    ):
+        said = runner.difference(meta, mujoco.MjModel.from_xml_string(changed))
+        assert said == says or said.startswith(says)
+    path = tmp_path / "other.xml"
+    path.write_text(swapped)
+    monkeypatch.setattr(sys, "argv", ["runner", str(onnx_file), "--model", str(path)])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(RUNNER), run_name="__main__")
+    said = capsys.readouterr().err
+    assert end.value.code == 2 and said.count("\n") == 1
+    assert said.startswith(f"error: {path} is not the robot of {onnx_file}: the joint of actuator")
 
 
 def test_motor_torque_is_the_packages(runner, symmetric, xbot):

@@ -191,6 +191,30 @@ def test_a_session_has_the_disturbances_of_play(still):
     )
 
 
+def test_a_standing_robot_does_not_turn_back_and_forth(still):
+    """As in training: a turn on the spot that has ended begins again only with another command."""
+    live, stand = session.Session(still, C_MUJOCO), np.zeros(3)
+
+    def steps(yaw, command):
+        """True if the robot may step after one control step from this yaw [rad]."""
+        memory, quat = live._memory, [np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)]
+        turned = memory.env.physics.replace(qpos=memory.env.physics.qpos.at[3:7].set(quat))
+        live._memory = memory.replace(env=memory.env.replace(physics=turned))
+        live.advance(command)
+        return bool(live._memory.env.command.moving)
+
+    assert still.config.command.stand_still
+    assert [steps(yaw, stand) for yaw in (0.0, 0.5, -0.5)] == [False] * 3
+    assert steps(0.0, np.array([0.0, 0.0, 0.12]))
+    assert [steps(yaw, stand) for yaw in (0.0, 0.5)] == [False] * 2
+    assert steps(0.5, np.array([0.5, 0.0, 0.0]))
+    assert steps(0.5, stand) and steps(0.5, stand)  # a new command
+    assert [steps(yaw, stand) for yaw in (0.1, 0.5)] == [False] * 2
+    leg = live._memory.leg
+    live._memory = live._memory.replace(leg=leg.replace(heading=leg.heading + 0.01))
+    assert steps(0.5, stand)
+
+
 def test_a_joystick_that_trembles_at_the_edge_of_the_dead_zone():
     before, seen = (False, False), []
     for vx in (0.19, 0.2, 0.21, 0.19, 0.185, -0.19, 0.179, 0.19, 0.21):
@@ -541,7 +565,7 @@ def test_following_does_not_wait_for_several_seeds(tmp_path, monkeypatch):
         (run_dir / "seed-3" / files.CONFIG).touch()
 
     monkeypatch.setattr(following.time, "sleep", sleep)
-    with pytest.raises(ConfigError, match="several trainings, name one: .*/mine/seed-3$"):
+    with pytest.raises(ConfigError, match=r"several trainings, name one: .*/mine/seed-3$"):
         following.Follower(run_dir).wait()
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="file is no run folder of a training"):
