@@ -14,8 +14,9 @@ import contextlib
 import copy
 import functools
 import io
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any
 
 import flax.struct
@@ -274,6 +275,31 @@ def _refresh_sensors(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 # -------------------------------------------------------------------------------------- mujoco
 
+UNSTABLE = "The simulation is unstable"
+"""Part of MuJoCo's warnings of robots that diverge."""
+
+
+def _say(warning: str) -> None:
+    """Prints a warning of MuJoCo, unless a robot diverges: callers see that in its numbers."""
+    with contextlib.suppress(Exception):  # an error here would end the process
+        if UNSTABLE not in warning:
+            print(f"warning: MuJoCo: {warning}", file=sys.stderr)
+
+
+@contextlib.contextmanager
+def own_warnings() -> Generator[None]:
+    """Within the context MuJoCo writes no file MUJOCO_LOG.TXT into the user's folder, see `_say`.
+
+    If the user handles MuJoCo's warnings, this stays so.
+    """
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(before or _say)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+
+
 _batches_lock = threading.Lock()
 
 
@@ -342,7 +368,7 @@ def _host_step(
     )
     target = rows(target)
     applied = {} if force is None else {"xfrc_applied": force}
-    with _batches_lock:
+    with _batches_lock, own_warnings():
         moved = {} if planes is None else dict(zip(("geom_pos", "geom_quat"), planes, strict=True))
         written = frozenset(fields | applied | moved)
         batch = _batch(robot, len(target), config.threads, written)

@@ -467,6 +467,27 @@ def test_divergence_shows_as_nan_not_as_a_reset():
     assert not np.all(np.isfinite(step(state, jnp.zeros(16), randomize.nominal(XBOT)).qpos))
 
 
+def test_a_diverging_robot_leaves_no_file(tmp_path, monkeypatch, capfd):
+    """MuJoCo would warn in MUJOCO_LOG.TXT in the present folder."""
+    step = make_step("mujoco")
+    state = standing(PhysicsConfig(engine="mujoco"))
+    state = state.replace(qvel=state.qvel.at[3].set(jnp.nan))
+    monkeypatch.chdir(tmp_path)
+    seen = []
+    try:
+        for handler in (seen.append, None):
+            mujoco.set_mju_user_warning(handler)
+            physics._batch.cache_clear()
+            jax.block_until_ready(step(state, jnp.zeros(16), randomize.nominal(XBOT)))
+            assert mujoco.get_mju_user_warning() == handler
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert seen and all(physics.UNSTABLE in x for x in seen)  # the user's handler stays
+    assert list(tmp_path.iterdir()) == [] and capfd.readouterr() == ("", "")
+    physics._say("Contact buffer is full")
+    assert capfd.readouterr().err == "warning: MuJoCo: Contact buffer is full\n"
+
+
 def test_sensors_are_those_of_the_new_state(xbot):
     """Sensors of the state one physics step before would differ by up to 0.08 in this motion."""
     step, state = make_step("mujoco"), standing(PhysicsConfig(engine="mujoco"))

@@ -80,7 +80,8 @@ def _hold(
     _, data.ctrl[:], model.actuator_biasprm[:, SERVO_DAMPING] = drive(
         robot, dynamics, data.qpos[7:], data.qvel[6:], robot.default_qpos[7:], np
     )
-    mujoco.mj_step(model, data)
+    with physics.own_warnings():
+        mujoco.mj_step(model, data)
 
 
 def engines_apart(config: PhysicsConfig) -> float:
