@@ -85,6 +85,24 @@ def test_a_yaw_rate_never_turns_the_other_way(still, rate):
     assert float(steered.velocity[2]) == pytest.approx(np.clip(rate, -1.0, 1.0), abs=1e-5)
 
 
+def test_a_turn_that_has_ended_begins_again_only_with_another_command(still):
+    """A robot that stands at a heading of 0 and is turned by 0.5 rad."""
+    state = env.reset(still.config, jax.random.key(1), still.curriculum)
+
+    def steps(yaw, heading=0.0, vx=0.0):
+        """True if the robot may step under this command, at this yaw [rad]."""
+        nonlocal state
+        state = trials.with_command(still.config, state, jnp.array([vx, 0.0, 0.0]), heading)
+        command = commands.steer(still.config.command, state.command, jnp.asarray(yaw), 1.0)
+        state = state.replace(command=command)
+        return bool(command.moving)
+
+    assert still.config.command.stand_still and steps(0.5, vx=0.5)
+    assert [steps(0.5), steps(0.5), steps(0.1), steps(0.5)] == [True, True, False, False]
+    assert [steps(0.5, heading=0.01), steps(0.0, heading=0.01)] == [True, False]
+    assert [steps(0.5, heading=0.01, vx=0.5), steps(0.5, heading=0.01)] == [True, True]
+
+
 def test_one_trial_has_no_interval_and_a_rest_no_stride(xbot):
     trace = synthetic()
     one = jax.tree.map(lambda x: x[:, :1], trace)

@@ -198,12 +198,18 @@ def with_command(
     A yaw rate other than 0 sets the commanded heading ahead of the robot, by at most `FARTHEST`:
     beyond half a turn the robot would turn the other way. With a yaw rate of 0 the commanded
     heading is `heading` [rad].
+
+    While a command holds, a turn on the spot that has ended does not begin again, as in training
+    (`commands.steer`). Else a standing robot near the smallest such turn would step and stop again
+    and again.
     """
     yaw = signals.read(physics.robot_for(config.physics), state.physics).base_euler[2]
     ahead = yaw + jnp.clip(velocity[2] / config.command.heading_gain, -FARTHEST, FARTHEST)
     heading = jnp.where(velocity[2] == 0.0, heading, ahead)
-    command = commands.with_velocity(config.command, state.command, velocity)
-    return state.replace(command=command.replace(heading=heading))
+    before, now = state.command, commands.with_velocity(config.command, state.command, velocity)
+    held = (heading == before.heading) & jnp.all(now.wanted == before.wanted)
+    turns = jnp.where(held, before.turns, now.turns)
+    return state.replace(command=now.replace(heading=heading, turns=turns))
 
 
 def run(

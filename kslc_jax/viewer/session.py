@@ -114,7 +114,7 @@ def _advance(
 ) -> tuple[Memory, View]:
     """One control step. After a fall the view shows the state before the step."""
     leg = _next_leg(config, schedule, memory, asked)
-    before = _commanded(config, memory.env, leg)
+    before = trials.with_command(config, memory.env, leg.velocity, leg.heading)
     action = Policy(config, params, curriculum, 0).act_on(before.history)
     key_step = jax.random.fold_in(key, count)
     simulate = functools.partial(_simulate, asked.force)
@@ -125,20 +125,6 @@ def _advance(
     leg = leg.replace(heading=jnp.where(leg.velocity[2] == 0.0, leg.heading, yaw))
     again = Memory(after, schedules.before_start(0.0), jax.random.fold_in(memory.key, count))
     return maths.tree_where(fallen, again, Memory(after, leg, memory.key)), view
-
-
-def _commanded(config: Config, state: env.EnvState, leg: Leg) -> env.EnvState:
-    """The environment with the command of the leg.
-
-    While a command holds, a turn on the spot that has ended does not begin again, as in training
-    (`commands.steer`). Else a standing robot near the smallest such turn would step and stop again
-    and again. A commanded yaw rate other than 0 is new at each step: its heading moves on.
-    """
-    given = trials.with_command(config, state, leg.velocity, leg.heading)
-    before, now = state.command, given.command
-    held = (leg.velocity[2] == 0.0) & (now.heading == before.heading)
-    held &= jnp.all(now.wanted == before.wanted)
-    return given.replace(command=now.replace(turns=jnp.where(held, before.turns, now.turns)))
 
 
 def _next_leg(config: Config, schedule: Schedule | None, memory: Memory, asked: Asked) -> Leg:
