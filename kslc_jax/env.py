@@ -77,7 +77,7 @@ class Outcome:
     ends_command: jax.Array  # [] bool, a new command is drawn after this step
     commanded: jax.Array  # [] m/s, commanded vx
     speed: jax.Array  # [] m/s, vx of the base, base frame
-    episode_steps: jax.Array  # [] int, age of the episode, see train_step.init
+    episode_steps: jax.Array  # [] int, age of the episode, see train_step._episodes
     speeding: jax.Array  # [] bool, a joint is at or above its speed limit
 
 

@@ -59,23 +59,47 @@ def _jitted(config: Config):
 
 
 def init(config: Config, seed: int | jax.Array) -> TrainState:
-    """State before the first train step.
-
-    Each first episode starts at a random age, so that time limits are spread evenly from the start.
-    `Outcome.episode_steps` includes this age.
-    """
+    """State before the first train step."""
     key, key_params, key_env, key_time = jax.random.split(jax.random.key(seed), 4)
     curriculum = curriculum_lib.init(config)
-    env_keys = jax.random.split(key_env, config.env.num_envs)
-    envs = jax.vmap(env.reset, (None, 0, None))(config, env_keys, curriculum)
-    times = jax.random.randint(key_time, (config.env.num_envs,), 0, config.episode_steps)
+    envs = _episodes(config, key_env, key_time, curriculum)
     return TrainState(
         learner=ppo.init(config.ppo, networks.init(config, key_params)),
-        env=envs.replace(time=times, command_since=times, command_until=times + envs.command_until),
+        env=envs,
         curriculum=curriculum,
         key=key,
         step=jnp.zeros((), jnp.int32),
     )
+
+
+def _episodes(
+    config: Config, key_env: jax.Array, key_time: jax.Array, curriculum: Curriculum
+) -> EnvState:
+    """New episodes [N]. Each starts at a random age, so that time limits are spread evenly.
+
+    `Outcome.episode_steps` includes this age.
+    """
+    env_keys = jax.random.split(key_env, config.env.num_envs)
+    envs = jax.vmap(env.reset, (None, 0, None))(config, env_keys, curriculum)
+    times = jax.random.randint(key_time, (config.env.num_envs,), 0, config.episode_steps)
+    return envs.replace(time=times, command_since=times, command_until=times + envs.command_until)
+
+
+_jitted_episodes = jax.jit(_episodes, static_argnums=0)
+
+
+def new_episodes(
+    config: Config, key: jax.Array, step: jax.Array, curriculum: Curriculum
+) -> EnvState:
+    """New episodes [N] as in `init`, for a training that goes on without its environments.
+
+    Args:
+      config: as in `make`; `config.seed` and `config.run` cause no new compilation.
+      key, step, curriculum: of the training's state.
+    """
+    # `step_keys` are the keys 0 and 1 of this train step.
+    keys = jax.random.split(jax.random.fold_in(jax.random.fold_in(key, step), 2))
+    return _jitted_episodes(dataclasses.replace(config, seed=0, run=RunConfig()), *keys, curriculum)
 
 
 def start_from(

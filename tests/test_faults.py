@@ -859,21 +859,42 @@ class TestDamage:
         step, (warning,) = restored(tmp_path)
         assert step == 1 and "damaged" in warning
 
-    def test_a_run_that_was_carried_without_environments(self, saved, like, tmp_path):
-        """Everything else is as it was saved, and every robot begins a new episode."""
+    @pytest.fixture
+    def carried(self, saved, like, tmp_path):
+        """Gives (the whole state, the state restored without environments, warnings)."""
         saved(tmp_path, 1, 2)
-        said = []
-        with contextlib.closing(Store(tmp_path)) as store:
-            whole = store.restore(like, said.append)
-        for step in ("1", "2"):
-            shutil.rmtree(tmp_path / "checkpoints" / step / "env")
-        with contextlib.closing(Store(tmp_path)) as store:
-            state = store.restore(like, said.append)
-        (warning,) = said
+
+        def restore():
+            said = []
+            with contextlib.closing(Store(tmp_path)) as store:
+                whole = store.restore(like, said.append)
+            for step in ("1", "2"):
+                shutil.rmtree(tmp_path / "checkpoints" / step / "env")
+            with contextlib.closing(Store(tmp_path)) as store:
+                return whole, store.restore(like, said.append), said
+
+        return restore
+
+    def test_a_run_that_was_carried_without_environments(self, carried, monkeypatch):
+        """Everything else is as it was saved. The new episodes are of the curriculum there."""
+        asked = []
+        monkeypatch.setattr(train_step, "new_episodes", lambda *x: asked.append(x) or "episodes")
+        whole, state, (warning,) = carried()
         assert "checkpoint 2 has no environments, all robots begin new episodes" in warning
-        assert np.isnan(state.env.physics.qvel).all()  # the sign for a new episode
-        same = [jax.tree.leaves(s.replace(env=None, key=None)) for s in (whole, state)]
-        assert all(np.array_equal(a, b) for a, b in zip(*same, strict=True))
+        assert state.env == "episodes"
+        assert same(whole.replace(env=None), state.replace(env=None))
+        ((config, key, step, curriculum),) = asked
+        assert config == DEBUG and step == 2 and key == whole.key
+        assert same(curriculum, whole.curriculum)
+
+    @pytest.mark.slow(reason="compiles the reset of the environments")
+    def test_new_episodes_begin_at_all_ages(self, carried, like):
+        """As in a new training: else all episodes would end at the same time."""
+        _, state, _ = carried()
+        assert jax.eval_shape(lambda: state.env) == like.env and rollout.finite(state.env)
+        ages = np.sort(state.env.time)
+        assert ages[0] < 0.3 * DEBUG.episode_steps and ages[-1] > 0.7 * DEBUG.episode_steps
+        assert (state.env.command_until > state.env.time).all()
 
     def test_policy_with_flipped_bits(self, saved, restored, tmp_path):
         saved(tmp_path, 1)

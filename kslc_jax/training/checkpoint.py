@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
-from kslc_jax import files, ppo, rollout
+from kslc_jax import config as config_lib
+from kslc_jax import files, ppo, train_step
 from kslc_jax.checkpoint_format import (
     CheckpointError,
     abstract,
@@ -20,6 +20,7 @@ from kslc_jax.checkpoint_format import (
     clear_away,
     forget_where,
     metadata,
+    owner,
     require_checksum,
 )
 from kslc_jax.config import Config
@@ -189,8 +190,9 @@ class Store:
             reasons.append(f"the robot has changed since checkpoint {step}: {changed}")
         found = {name: restored[name] for name in items}
         if carried:
-            blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), like.env)
-            found[ENVIRONMENTS] = rollout.broken_state(blank)
+            config = config_lib.from_dict(meta["config"], owner(folder))
+            key, done, reached = (found["core"][name] for name in ("key", "step", "curriculum"))
+            found[ENVIRONMENTS] = train_step.new_episodes(config, key, done, reached)
         return _join(found, like), reasons
 
     def close(self) -> None:
