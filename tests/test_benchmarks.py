@@ -3,6 +3,7 @@
 import dataclasses
 import gzip
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -27,8 +28,9 @@ from benchmarks import (
     timeline,
     timing,
 )
-from kslc_jax import observations, physics, randomize, signals, train_step
-from kslc_jax.config import preset
+from kslc_jax import observations, physics, policy, randomize, signals, train, train_step
+from kslc_jax.config import ConfigError, preset
+from kslc_jax.training import run_folder
 
 
 def test_runs_take_turns_and_first_calls_do_not_count(monkeypatch):
@@ -416,34 +418,141 @@ def test_gpu_questions_in_small(question, plan):
         assert min(v for name, v in found.items() if name.endswith("steps/s")) > 0
 
 
-def test_lent_gpu_stops_and_carries_without_environments(tmp_path, monkeypatch, capsys):
-    """The time ends by SIGTERM. The copy has one checkpoint without environments, and snapshots."""
-    sleeper = tmp_path / "kslc_jax" / "train.py"
-    sleeper.parent.mkdir()
-    sleeper.write_text("import time\ntime.sleep(1000)\n")
+def written(folder, *names, size=2000):
+    """Writes files into a run folder."""
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(bytes(size))
+
+
+@pytest.fixture
+def lent(tmp_path, monkeypatch):
+    """Options for a run of a made-up training; `lent.program` sets what it does."""
+    made_up = tmp_path / "kslc_jax" / "train.py"
+    made_up.parent.mkdir()
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     run = tmp_path / "runs" / "seed-3"
-    for name in ("checkpoints/8/env", "checkpoints/8/params", "checkpoints/9/params"):
-        (run / name).mkdir(parents=True)
-    for name in ("checkpoints/9/env", "snapshots/4/params", "tensorboard"):
-        (run / name).mkdir(parents=True)
-    for name in ("config.json", "metrics.jsonl", ".lock"):
-        (run / name).write_text("0123456789")
-    for folder in ("checkpoints/9/env", "checkpoints/9/params", "snapshots/4/params"):
-        (run / folder / "d").write_bytes(bytes(2000))
-    args = lent_gpu.Args(tmp_path / "out", seconds=0.1, run_dir=tmp_path / "runs")
+    kept = ("config.json", "metrics.jsonl", "robot/r.xml", "checkpoints/19/params/d")
+    kept += ("checkpoints/19/core/d", "snapshots/4/params/d", "snapshots/14/params/d")
+    written(run, *kept, "tensorboard/events", ".lock", "checkpoints/19/env/d")
+    written(run, "checkpoints/8/params/d", "snapshots/16.tmp/params/d")
+    args = lent_gpu.Args(tmp_path / "out", seconds=60.0, run_dir=tmp_path / "runs", resume=True)
+    return SimpleNamespace(program=made_up.write_text, args=args, run=run, kept=set(kept))
+
+
+def files_in(folder):
+    return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_lent_gpu_stops_and_carries_without_environments(lent, tmp_path, capsys):
+    """The time ends by SIGTERM. The copy has the last checkpoint without environments."""
+    lent.program("import time\ntime.sleep(1000)\n")
+    args = dataclasses.replace(lent.args, seconds=0.1)
     assert lent_gpu.main(args) == -signal.SIGTERM
-    copied = sorted(str(p.relative_to(args.out)) for p in args.out.rglob("*") if p.is_file())
-    kept = ("checkpoints/9/params/d", "config.json", "metrics.jsonl", "snapshots/4/params/d")
-    assert copied == [f"seed-3/{name}" for name in kept]
-    assert "seed-3: 0.0 MB" in capsys.readouterr().out
-    assert lent_gpu.main(args) == 2 and "exists" in capsys.readouterr().err
-    sleeper.write_text("")  # a training that ends by itself
-    args = dataclasses.replace(args, out=tmp_path / "again", seconds=600.0)
-    assert lent_gpu.main(args) == 0
-    monkeypatch.setattr(lent_gpu, "LIMIT", 1000)  # of a file
-    assert lent_gpu.main(dataclasses.replace(args, out=tmp_path / "large")) == 1
+    names = [lent_gpu.part_name(i, args.parts) for i in range(args.parts)]
+    assert sorted(path.name for path in args.out.iterdir()) == names
+    assert f"{args.out}: 0.0 MiB in 4 files\n" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="out is not empty"):
+        lent_gpu.main(args)
+    there = tmp_path / "there"
+    assert lent_gpu.main(lent_gpu.Args(there / "lent", unpack=args.out)) == 0
+    assert files_in(there / "lent" / "seed-3") == lent.kept
+    said = f"go on with: python -m kslc_jax.train --resume --run-dir {there / 'lent'}\n"
+    assert capsys.readouterr().out == said
+    (args.out / names[2]).unlink()
+    assert lent_gpu.main(lent_gpu.Args(there / "again", unpack=args.out)) == 1
+    assert capsys.readouterr().err.startswith(f"error: {args.out} lacks carried-3-of-4.tar; ")
+    with pytest.raises(ConfigError, match="holds no copy: no file such as "):
+        lent_gpu.main(lent_gpu.Args(there / "third", unpack=tmp_path / "none"))
+
+
+def test_lent_gpu_copies_while_it_trains(lent, tmp_path, monkeypatch):
+    """A training that is killed from outside leaves the copy of the minute before."""
+    monkeypatch.setattr(lent_gpu, "EVERY", 0.0)
+    copied = lent.args.out / lent_gpu.part_name(3, 4)
+    lent.program(
+        "import pathlib, time\n"
+        f"while not pathlib.Path({str(copied)!r}).exists():\n    time.sleep(0.01)\n"
+    )
+    assert lent_gpu.main(lent.args) == 0
+
+
+def test_lent_gpu_kills_a_training_that_does_not_stop(lent, monkeypatch, capsys):
+    lent.program("import signal, time\nsignal.signal(15, signal.SIG_IGN)\ntime.sleep(1000)\n")
+    monkeypatch.setattr(lent_gpu, "GRACE", 0.2)
+    args = dataclasses.replace(lent.args, seconds=0.5)  # until the signal is ignored
+    assert lent_gpu.main(args) == -signal.SIGKILL
+    said = capsys.readouterr().out
+    assert "not saved after 0 s: killed\n" in said and "MiB in 4 files" in said
+
+
+def test_lent_gpu_leaves_a_run_that_is_there(lent):
+    """A new training is refused as `train` refuses it, and nothing is copied."""
+    lent.program("")
+    with pytest.raises(run_folder.RunError, match="already holds a training of 1 seeds: go on"):
+        lent_gpu.main(dataclasses.replace(lent.args, resume=False))
+    assert not lent.args.out.exists()
+
+
+def test_lent_gpu_passes_options_on():
+    """What comes after -- goes to the training."""
+    ours = ["--out", "o", "--preset", "paper", "--seeds", "1"]
+    args, options = lent_gpu.parse([*ours, "--", "--ppo.clip", "0.1"])
+    words = lent_gpu.command(args, options)
+    assert words[2:7] == ["kslc_jax.train", "--run-dir", "runs/lent", "--preset", "paper"]
+    assert words[-2:] == ["--ppo.clip", "0.1"] and "--resume" not in words
+    assert "--preset" not in lent_gpu.command(dataclasses.replace(args, resume=True), ())
+    assert lent_gpu.parse(ours)[1] == []
+
+
+def test_lent_gpu_carries_the_most_important_first(lent, tmp_path, capsys):
+    """Last states of all seeds, then metrics, then snapshots, newest first. What does not fit is
+    named, and no file is larger than asked for."""
+    other = lent.run.with_name("seed-4")
+    shutil.copytree(lent.run, other)
+    groups = [f"{run}: {what}" for what in ("its last state", "its metrics") for run in SEEDS]
+    groups += [f"{run}: snapshot {step}" for step in (14, 4) for run in SEEDS]
+    assert list(lent_gpu.wanted(lent.args.run_dir)) == groups
+    room = 2 * 2**20
+    written(lent.run, "snapshots/4/params/d", size=room)
+    written(other, "checkpoints/19/core/d", size=room - lent_gpu.END - lent_gpu.HEADERS)
+    left = lent_gpu.carry(lent.args.run_dir, lent.args.out, 2, room)
+    assert left == ["seed-3: snapshot 4"]
+    sizes = [path.stat().st_size for path in sorted(lent.args.out.iterdir())]
+    assert sizes[0] < 50_000 and room - 20_000 < sizes[1] <= room
+    lent.program("")
+    args = dataclasses.replace(lent.args, out=tmp_path / "small", parts=1, part_mib=0.0625)
+    assert lent_gpu.main(args) == 1
+    said = capsys.readouterr().out
+    assert "did not fit: seed-4: its last state; seed-3: snapshot 4\n" in said
+
+
+SEEDS = ("seed-3", "seed-4")
+
+
+@pytest.mark.slow(reason="a process that trains, then a training in this one")
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_a_carried_training_goes_on(seeds, tmp_path, capsys):
+    """Train, carry, unpack, resume: the metrics go on where they were, as in one training."""
+    args = lent_gpu.Args(
+        tmp_path / "out", run_dir=tmp_path / "lent", preset="debug", seeds=seeds, snapshots=1
+    )
+    batch = preset("debug").batch_size
+    assert lent_gpu.main(args, ("--steps", str(3 * batch))) == 0
+    run = tmp_path / "runs" / "lent"
+    assert lent_gpu.main(lent_gpu.Args(run, unpack=args.out)) == 0
+    capsys.readouterr()
+    assert train.main(["--resume", "--run-dir", str(run), "--steps", str(5 * batch)]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("3 has no environments, all robots begin new episodes") == seeds
+    folders = [run] if seeds == 1 else [run / "seed-0", run / "seed-1"]
+    for folder in folders:
+        rows = [json.loads(row) for row in (folder / "metrics.jsonl").read_text().splitlines()]
+        assert [row["step"] for row in rows] == [1, 2, 3, 4, 5]
+        assert {row["broken"] for row in rows} == {0.0}
+        assert policy.load_policy(folder).step == 5
+        assert policy.load_policy(folder / "snapshots" / "3").step == 3
 
 
 @pytest.mark.slow(reason="compiles MJX three times and starts worker processes")
