@@ -23,9 +23,12 @@ from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_train
 from brax.training.networks import FeedForwardNetwork
 
+from benchmarks import brax_on_new_jax
 from kslc_jax import curriculum as curriculum_lib
 from kslc_jax import env, networks, observations, physics
 from kslc_jax.config import Config
+
+brax_on_new_jax.prepare()
 
 
 class Adapter(brax.envs.Env):
