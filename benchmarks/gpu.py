@@ -6,10 +6,11 @@ physics always computes in full float32. All programs compile first, at the same
 If a case fails, the benchmark prints it and goes on with the others.
 
 With --all it answers five questions instead (gpu_all.py), in at most eight minutes: five seeds in
-one program, bit-exactness, the `paper` preset, larger batches, Brax.
+one program, the `paper` preset, larger batches, Brax, bit-exactness.
 
   python -m benchmarks.gpu --out gpu.json
   python -m benchmarks.gpu --all --out h100.json              # writes h100-seeds.json and so on
+  python -m benchmarks.gpu --all --questions large --train --out h100.json   # time to 3.5 m/s
   python -m benchmarks.gpu --preset paper --cases mjx:4096x60 --out paper.json
   python -m benchmarks.gpu --preset debug --cases mjx:16x8 --precisions --repeats 1   # anywhere
 """
@@ -104,12 +105,13 @@ class Args:
     all: bool = False
     """Answer the questions of `questions` instead; --cases, --parts and --precisions do not count.
     Each answer goes to a file of its own: --out gpu.json writes gpu-seeds.json, gpu-exact.json."""
-    questions: tuple[gpu_all.Part, ...] = ("seeds", "exact", "paper", "large", "brax")
+    questions: tuple[gpu_all.Part, ...] = ("seeds", "paper", "large", "brax", "exact")
     """With --all: the questions, in this order."""
     budget: float = 420.0
-    """With --all: no question begins after this time [s], and each ends a minute later."""
+    """With --all: no question begins after this time [s], and all end a minute later."""
     train: bool = False
-    """With --all: larger batches also train until commands of 3.5 m/s, in the time that is left."""
+    """With --all: larger batches also train until commands of 3.5 m/s, in the time that their
+    question may take. Ask it alone: --questions large."""
     paper: str = "paper"
     """With --all: preset of the question `paper`. A test takes a small one."""
 
@@ -117,8 +119,17 @@ class Args:
 def main(args: Args) -> None:
     """Compiles all programs, measures them in turn, and prints a line for each."""
     if args.all:
-        how = args.preset, args.paper, args.budget, args.repeats, args.train, args.out
-        gpu_all.run(gpu_all.Plan(args.questions, *how))
+        gpu_all.run(
+            gpu_all.Plan(
+                parts=args.questions,
+                preset=args.preset,
+                paper=args.paper,
+                budget=args.budget,
+                repeats=args.repeats,
+                train=args.train,
+                out=args.out,
+            )
+        )
         return
     try:
         configs = {case: shaped(preset(args.preset), case) for case in args.cases}

@@ -1,39 +1,43 @@
 """`benchmarks.gpu --all`: five questions to a GPU in one run of at most eight minutes.
 
-Each part runs in processes of its own, so that its failure ends no other part. Its numbers are
-printed, and written to a file of its own, as soon as it is done. The parts, in their order:
+Each part runs in processes of its own, so that its failure ends no other part, and has a limited
+time, so that those after it get theirs. Its numbers are printed when it ends. They are written to a
+file of its own as they come. The parts, in their order:
 
-- seeds: steps/s of five seeds in one program and of one seed; compile times;
-- exact: is a training bit-exact over two runs and over a resume, in one process and in two, with
-  and without XLA's deterministic operations? The cost of these in steps/s;
-- paper: steps/s of the `paper` preset;
+- seeds: steps/s of five seeds in one program and of one seed;
+- paper: steps/s of the `paper` preset; compile times;
 - large: steps/s with 2 and 4 times the environments and minibatches; with --train also the time
   until commands of 3.5 m/s;
-- brax: steps/s of Brax PPO and of ours, in turn.
+- brax: steps/s of Brax PPO and of ours, in turn;
+- exact: is a training bit-exact over two runs and over a resume, in one process and in two, with
+  and without XLA's deterministic operations? The cost of these in steps/s.
 """
 
 import importlib.util
-import json
 import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from benchmarks import gpu_parts, timing
 from benchmarks.gpu_parts import Numbers
-from kslc_jax import runtime
+from kslc_jax import files, runtime
 
-Part = Literal["seeds", "exact", "paper", "large", "brax"]
+Part = Literal["seeds", "paper", "large", "brax", "exact"]
 
 GRACE = 60.0
-"""A part ends at the latest so long [s] after the budget."""
+"""All parts end at the latest so long [s] after the budget."""
 
-BRAX_SECONDS = 90.0
-"""The trainings of `large` leave this time [s] to `brax`, which compiles two programs."""
+TWICE = ("exact",)
+"""Parts that measure twice, and so get twice the time."""
+
+SHARE = 1.75
+"""A part may take so many times its equal share of the time that is left, because most parts leave
+time over."""
 
 AS_IT_IS = "as it is"
 """Title of the numbers without an additional flag."""
@@ -63,36 +67,47 @@ class Plan:
 def run(plan: Plan) -> None:
     """Runs the parts one after the other. A part that fails is told and passed over."""
     start = time.monotonic()
+    missing = [part for part in plan.parts if part == "brax" and not _installed("brax")]
+    parts = [part for part in plan.parts if part not in missing]
+    for part in missing:
+        print(f"{part}: left out, brax is not installed", flush=True)
     with tempfile.TemporaryDirectory() as cache:
-        for part in plan.parts:
-            left = plan.budget - (time.monotonic() - start)
-            missing = part == "brax" and not _installed("brax")
-            if left <= 0 or missing:
-                why = "brax is not installed" if missing else f"{plan.budget:.0f} s are over"
-                print(f"{part}: left out, {why}", flush=True)
+        for index, part in enumerate(parts):
+            begun = time.monotonic()
+            left = plan.budget - (begun - start)
+            if left <= 0:
+                print(f"{part}: left out, {plan.budget:.0f} s are over", flush=True)
                 continue
             print(f"{part}:", flush=True)
-            begun = time.monotonic()
+            numbers: Numbers = {}
+            failure = ""
             try:
-                numbers = _answer(part, plan, left, cache)
+                for numbers in _answer(part, plan, most(parts[index:], left + GRACE), cache):
+                    _write(plan, part, numbers)
             except (subprocess.SubprocessError, ValueError, LookupError) as error:
-                print(f"  failed: {runtime.first_line(error)}", flush=True)
-                continue
+                failure = f"  failed: {runtime.first_line(error)}\n"
             _show(numbers)
-            print(f"  in {time.monotonic() - begun:.0f} s", flush=True)
-            if plan.out:
-                plan.out.parent.mkdir(parents=True, exist_ok=True)
-                path = plan.out.with_name(f"{plan.out.stem}-{part}.json")
-                path.write_text(json.dumps(numbers, indent=1) + "\n")
+            print(f"{failure}  in {time.monotonic() - begun:.0f} s", flush=True)
+
+
+def most(parts: Sequence[Part], left: float) -> float:
+    """Most time [s] for the first of `parts`, which share `left` seconds."""
+    shares = [2.0 if part in TWICE else 1.0 for part in parts]
+    return min(left, SHARE * left * shares[0] / sum(shares))
 
 
 def _installed(package: str) -> bool:
     return importlib.util.find_spec(package) is not None
 
 
-def _answer(part: Part, plan: Plan, left: float, cache: str) -> Numbers:
-    """The numbers of a part that may take `left` seconds, and `GRACE` more."""
-    ends = time.monotonic() + left + GRACE
+def _write(plan: Plan, part: Part, numbers: Numbers) -> None:
+    if plan.out:
+        files.write_json(plan.out.with_name(f"{plan.out.stem}-{part}.json"), numbers)
+
+
+def _answer(part: Part, plan: Plan, seconds: float, cache: str) -> Iterator[Numbers]:
+    """The numbers of a part that may take `seconds`, as they come: the later ones have all."""
+    ends = time.monotonic() + seconds
     name = plan.paper if part == "paper" else plan.preset
 
     def child(part: str, flags: str = "", **options: Any) -> Numbers:
@@ -104,29 +119,28 @@ def _answer(part: Part, plan: Plan, left: float, cache: str) -> Numbers:
         return timing.child("benchmarks.gpu_parts", argv, env, ends - time.monotonic())
 
     if part == "exact":
-        return _both(child)
-    if part == "large" and plan.train:
-        comes = "brax" in plan.parts[plan.parts.index("large") :] and _installed("brax")
-        after = BRAX_SECONDS if comes else 0.0
-        return child(part, **{"train-seconds": max(left - after, 1.0)})
-    return child(part)
+        yield from _both(child)
+    elif part == "large" and plan.train:
+        yield child(part, **{"train-seconds": max(seconds - GRACE, 1.0)})
+    else:
+        yield child(part)
 
 
-def _both(child: Callable[..., Numbers]) -> Numbers:
+def _both(child: Callable[..., Numbers]) -> Iterator[Numbers]:
     """The part `exact`: two processes, without and with deterministic operations."""
     numbers: Numbers = {}
     for title, flags in ((AS_IT_IS, ""), (DETERMINISTIC, DETERMINISTIC)):
         with tempfile.TemporaryDirectory() as folder:
             first = child("exact", flags, folder=folder)
+            sums, numbers["machine"] = first.pop("sums"), first.pop("machine")
+            numbers[title] = first
+            yield numbers
             other = child("resumed", flags, folder=folder)
-        sums, numbers["machine"] = first.pop("sums"), first.pop("machine")
-        numbers[title] = {
-            "two processes": other["sums"] == sums,
-            "resume in two processes": other["resumed"] == sums[gpu_parts.STEPS // 2 :],
-            **first,
-        }
+        first["two processes"] = other["sums"] == sums
+        first["resume in two processes"] = other["resumed"] == sums[gpu_parts.STEPS // 2 :]
+        yield numbers
     rates = [numbers[title]["steps/s"] for title in (AS_IT_IS, DETERMINISTIC)]
-    return numbers | {"deterministic operations, times the steps/s": rates[1] / rates[0]}
+    yield numbers | {"deterministic operations, times the steps/s": rates[1] / rates[0]}
 
 
 def _show(numbers: Numbers, indent: str = "  ") -> None:

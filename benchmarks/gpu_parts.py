@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -51,8 +50,8 @@ def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def compiled(make: tuple[Any, Any], threads: bool) -> tuple[Any, Any, Numbers]:
-    """(first state, compiled train step, seconds): one after the other, or in two threads."""
+def compiled(make: tuple[Any, Any]) -> tuple[Any, Any, Numbers]:
+    """(first state, compiled train step, seconds). It compiles both at the same time."""
     import jax
 
     init, step = make
@@ -62,14 +61,18 @@ def compiled(make: tuple[Any, Any], threads: bool) -> tuple[Any, Any, Numbers]:
         return do(), time.monotonic() - start
 
     like = jax.eval_shape(init)
-    with ThreadPoolExecutor(2 if threads else 1) as pool:
+    with ThreadPoolExecutor(2) as pool:
         first = pool.submit(done, init)
         second = pool.submit(done, lambda: step.lower(like).compile())
         (state, until_state), (program, until_step) = first.result(), second.result()
-    if not threads:
-        until_step -= until_state
-    seconds = {"first state": until_state, "train step": until_step}
-    return state, program, seconds | {"together": time.monotonic() - start}
+    return state, program, {"first state": until_state, "train step": until_step}
+
+
+def programs(makes: dict[str, tuple[Any, Any]]) -> dict[str, tuple[Any, Any]]:
+    """(first state, compiled train step) of several trainings; all compile at the same time."""
+    with ThreadPoolExecutor(len(makes)) as pool:
+        done = pool.map(compiled, makes.values())
+        return {name: (state, step) for name, (state, step, _) in zip(makes, done, strict=True)}
 
 
 def in_turn(programs: dict[str, tuple[Any, Any]], repeats: int) -> dict[str, float]:
@@ -81,22 +84,17 @@ def in_turn(programs: dict[str, tuple[Any, Any]], repeats: int) -> dict[str, flo
 
 
 def seeds(args: Args) -> Numbers:
-    """One seed is compiled one program after the other, five seeds in two threads."""
+    """One seed and five seeds in one program, in turn."""
     from kslc_jax import train_step
     from kslc_jax.training import seeds as seeds_lib
 
     config = preset(args.preset)
-    one, step_one, alone = compiled(train_step.make(config), threads=False)
-    _say(f"one seed compiled: {alone}")
-    five, step_five, together = compiled(seeds_lib.make(config, SEEDS), threads=True)
-    _say(f"{SEEDS} seeds compiled: {together}")
-    seconds = in_turn({"one": (one, step_one), "five": (five, step_five)}, args.repeats)
+    makes = {"one": train_step.make(config), "five": seeds_lib.make(config, SEEDS)}
+    seconds = in_turn(programs(makes), args.repeats)
     return {
         "one seed, steps/s": config.batch_size / seconds["one"],
         f"{SEEDS} seeds, steps/s in all": SEEDS * config.batch_size / seconds["five"],
         f"{SEEDS} seeds in turn, times as long": SEEDS * seconds["one"] / seconds["five"],
-        "one seed, compile seconds, one after the other": alone,
-        f"{SEEDS} seeds, compile seconds, in two threads": together,
     }
 
 
@@ -109,7 +107,7 @@ def exact(args: Args) -> Numbers:
 
     config, folder = preset(args.preset), _required(args.folder)
     init, _ = make = train_step.make(config)
-    state, program, seconds = compiled(make, threads=True)
+    state, program, seconds = compiled(make)
     store = Store(folder)
     first = _sums(state, program, STEPS, lambda s: store.save(s, config, {}))
     store.wait()
@@ -168,13 +166,13 @@ def paper(args: Args) -> Numbers:
     from kslc_jax import train_step
 
     config = preset(args.preset)
-    state, program, seconds = compiled(train_step.make(config), threads=True)
+    state, program, seconds = compiled(train_step.make(config))
     median = in_turn({"step": (state, program)}, args.repeats)["step"]
     return {"steps/s": config.batch_size / median, "compile seconds, in two threads": seconds}
 
 
 def large(args: Args) -> Numbers:
-    """All programs compile at the same time. Trainings begin from new first states.
+    """Trainings begin from new first states.
 
     Each training gets an equal share of the time that is left after those before it.
     """
@@ -182,17 +180,15 @@ def large(args: Args) -> Numbers:
     from kslc_jax import train_step
 
     configs = larger(preset(args.preset))
-    with ThreadPoolExecutor(len(configs)) as pool:
-        makes = {name: train_step.make(config) for name, config in configs.items()}
-        done = pool.map(partial(compiled, threads=False), makes.values())
-        programs = {name: d[:2] for name, d in zip(makes, done, strict=True)}
-    seconds = in_turn(programs, args.repeats)
+    makes = {name: train_step.make(config) for name, config in configs.items()}
+    made = programs(makes)
+    seconds = in_turn(made, args.repeats)
     numbers: Numbers = {
         f"{name}, steps/s": configs[name].batch_size / s for name, s in seconds.items()
     }
     for name, value in numbers.items():
         _say(f"{name}: {value:.0f}")  # in case that a training is killed
-    waiting = list(programs.items()) if args.train_seconds else []
+    waiting = list(made.items()) if args.train_seconds else []
     while waiting:
         share = (ends - time.monotonic()) / len(waiting)
         name, (_, program) = waiting.pop(0)
@@ -219,10 +215,10 @@ def until(speed: float, state: Any, program: Any, seconds: float) -> tuple[float
     None if they do not within `seconds`.
     """
     start = time.monotonic()
-    while (now := time.monotonic() - start) < seconds:
+    while time.monotonic() - start < seconds:
         state, metrics = program(state)
-        if float(metrics["curriculum/v_max"]) >= speed:
-            return now, int(metrics["step"])
+        if float(metrics["curriculum/v_max"]) >= speed:  # waits for the train step
+            return time.monotonic() - start, int(metrics["step"])
     return None
 
 

@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tyro
 from states import ACTOR, BIPED, XBOT, make_command, make_gait
 
 from benchmarks import (
+    brax_on_new_jax,
     compile_time,
     gpu,
     gpu_all,
@@ -133,6 +135,22 @@ def test_brax_gets_our_networks(debug):
     mean, std = made.policy_network.apply(None, policy, obs)
     assert mean.shape == std.shape == (3, robot.count)
     assert made.value_network.apply(None, value, obs).shape == (3,)
+
+
+def test_brax_gets_what_a_new_jax_lacks(monkeypatch):
+    """One copy for each device, also of random keys; a JAX that has the function keeps its own."""
+    tree = {"key": jax.random.key(3), "x": jnp.arange(3.0)}
+    devices = jax.local_devices()[:1]
+    copies = brax_on_new_jax.replicated(tree, devices)
+    assert copies["key"].shape == (1,) and copies["key"][0] == tree["key"]
+    np.testing.assert_array_equal(copies["x"], [[0.0, 1.0, 2.0]])
+    assert copies["x"].sharding.spec == jax.sharding.PartitionSpec("i")
+    monkeypatch.setattr(brax_on_new_jax, "jax", SimpleNamespace())
+    brax_on_new_jax.prepare()
+    assert brax_on_new_jax.jax.device_put_replicated is brax_on_new_jax.replicated
+    monkeypatch.setattr(brax_on_new_jax, "jax", SimpleNamespace(device_put_replicated="its own"))
+    brax_on_new_jax.prepare()
+    assert brax_on_new_jax.jax.device_put_replicated == "its own"
 
 
 @pytest.mark.slow(reason="compiles a second train step")
@@ -298,6 +316,15 @@ def plan(tmp_path):
     return gpu_all.Plan(("seeds", "paper"), "debug", "debug", 100.0, 1, False, tmp_path / "g.json")
 
 
+def test_gpu_asks_for_a_plan(plan, monkeypatch):
+    plans = []
+    monkeypatch.setattr(gpu_all, "run", plans.append)
+    args = gpu.Args(plan.out, "debug", repeats=1, all=True, questions=plan.parts)
+    gpu.main(dataclasses.replace(args, budget=100.0, paper="debug"))
+    assert plans == [plan]
+    assert gpu.Args().questions[-1] == "exact"  # its four processes take longest
+
+
 def test_gpu_questions_go_on_without_what_fails(plan, monkeypatch, capsys):
     """A part that fails or comes too late is told; the others are printed and written."""
 
@@ -340,8 +367,36 @@ def test_gpu_question_of_exactness(plan, monkeypatch):
         assert found[title]["two processes"] and found[title]["resume in two processes"] == exact
 
 
-@pytest.mark.parametrize(("installed", "seconds"), [(True, 10.0), (False, 100.0)])
+def test_gpu_questions_keep_what_they_have_when_their_time_is_over(plan, monkeypatch, capsys):
+    """The second process of `exact` takes too long; what the first one found stands."""
+
+    def child(module, argv, env, timeout):
+        if "resumed" in argv:
+            raise subprocess.TimeoutExpired("resumed", timeout)
+        return {"machine": {}, "sums": [1], "two runs": True, "steps/s": 100.0}
+
+    monkeypatch.setattr(timing, "child", child)
+    gpu_all.run(dataclasses.replace(plan, parts=("exact",)))
+    found = json.loads(plan.out.with_name("g-exact.json").read_text())
+    assert found[gpu_all.AS_IT_IS] == {"two runs": True, "steps/s": 100.0}
+    said = capsys.readouterr().out
+    assert "    two runs: True\n" in said and "  failed: Command 'resumed' timed out" in said
+
+
+def test_gpu_questions_share_the_time():
+    """One that takes all its time leaves some to those after it; the last one gets all."""
+    parts, left = ("seeds", "paper", "large", "brax", "exact"), 480.0
+    given = []
+    for index in range(len(parts)):
+        given.append(gpu_all.most(parts[index:], left))
+        left -= given[-1]
+    assert given == pytest.approx([140.0, 119.0, 96.7, 72.5, 51.8], abs=0.1)
+    assert gpu_all.most(("large",), 480.0) == 480.0
+
+
+@pytest.mark.parametrize(("installed", "seconds"), [(True, 80.0), (False, 100.0)])
 def test_gpu_trainings_leave_time_to_brax(installed, seconds, plan, monkeypatch):
+    """Of 160 s, seven eighths at most; they end a minute before that."""
     large = []
 
     def child(module, argv, env, timeout):
@@ -354,6 +409,30 @@ def test_gpu_trainings_leave_time_to_brax(installed, seconds, plan, monkeypatch)
     gpu_all.run(dataclasses.replace(plan, parts=("large",), train=True))
     gpu_all.run(dataclasses.replace(plan, parts=("large", "brax"), train=True))
     assert large == pytest.approx([100.0, seconds], abs=1.0)
+
+
+def test_gpu_question_of_brax(plan, monkeypatch):
+    """The process is asked for Brax; it compares Brax with ours."""
+    from benchmarks import comparison
+
+    asked = []
+
+    def child(module, argv, env, timeout):
+        args = tyro.cli(gpu_parts.Args, args=argv)
+        return {"machine": {}, **gpu_parts.PARTS[args.part](args)}
+
+    def on_mjx(*how):
+        asked.append(how)
+        return {"kslc_jax": [1.0], "brax": [2.0]}
+
+    monkeypatch.setattr(timing, "child", child)
+    monkeypatch.setattr(comparison, "on_mjx", on_mjx)
+    monkeypatch.setattr(gpu_all, "_installed", lambda package: True)
+    gpu_all.run(dataclasses.replace(plan, parts=("brax",), repeats=3))
+    assert asked == [(preset("debug"), 3, ("brax",))]
+    found = json.loads(plan.out.with_name("g-brax.json").read_text())
+    assert found["brax"]["times_slower"] == 2.0
+    assert found["kslc_jax"]["steps_per_second"] == preset("debug").batch_size
 
 
 def test_gpu_trainings_share_the_time(monkeypatch):
@@ -370,7 +449,7 @@ def test_gpu_trainings_share_the_time(monkeypatch):
         return dict.fromkeys(programs, 0.5)
 
     monkeypatch.setattr(gpu_parts.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(gpu_parts, "compiled", lambda make, threads: (None, None, {}))
+    monkeypatch.setattr(gpu_parts, "compiled", lambda make: (None, None, {}))
     monkeypatch.setattr(gpu_parts, "in_turn", measured)
     monkeypatch.setattr(gpu_parts, "until", until)
     monkeypatch.setattr("kslc_jax.train_step.make", lambda config: (lambda: None, None))
@@ -379,13 +458,16 @@ def test_gpu_trainings_share_the_time(monkeypatch):
     assert set(numbers.values()) == {2 * 49152 / 0.5, 4 * 49152 / 0.5, (10.0, 3)}
 
 
-def test_gpu_training_until_a_speed():
-    speeds = iter([0.5, 3.0, 3.5, 4.0])
+def test_gpu_training_until_a_speed(monkeypatch):
+    """The time is that at the end of the train step that reaches it."""
+    speeds, now = iter([0.5, 3.0, 3.5, 4.0]), [5.0]
+    monkeypatch.setattr(gpu_parts.time, "monotonic", lambda: now[0])
 
     def program(state):
+        now[0] += 2.0
         return state + 1, {"curriculum/v_max": next(speeds), "step": state + 1}
 
-    assert gpu_parts.until(3.5, 0, program, 100.0)[1] == 3
+    assert gpu_parts.until(3.5, 0, program, 100.0) == (6.0, 3)
     assert gpu_parts.until(3.5, 0, program, 0.0) is None
 
 
