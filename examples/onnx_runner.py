@@ -29,11 +29,11 @@ class Controller:
         one.intra_op_num_threads = 1  # the network is small; more threads only wait
         self.network = onnxruntime.InferenceSession(path, one, providers=["CPUExecutionProvider"])
         text = self.network.get_modelmeta().custom_metadata_map
-        if text.get("metadata_version") != "6":
-            raise SystemExit(f"error: {path} has no metadata of version 6, see docs/export.md")
+        if text.get("metadata_version") != "5":
+            raise SystemExit(f"error: {path} has no metadata of version 5, see docs/export.md")
         m = {k: json.loads(v, object_hook=lambda x: SimpleNamespace(**x)) for k, v in text.items()}
         self.meta = m = SimpleNamespace(**m)
-        self.wanted = self.velocity = self.trim = np.zeros(2)
+        self.wanted = self.velocity = np.zeros(2)
         self.heading, self.turns = heading, True
         self.phase = 0.0
         self.command(vx, vy, heading)
@@ -58,25 +58,9 @@ class Controller:
 
     def approach(self, dt):
         """Moves the velocity towards the wanted one, for `dt` seconds."""
-        way, acceleration = self.way(), self.meta.command.acceleration
+        way, acceleration = self.wanted - self.velocity, self.meta.command.acceleration
         share = acceleration * dt / max(np.hypot(*way), 1e-6) if acceleration else 1
         self.velocity = self.velocity + way * min(share, 1)
-
-    def way(self):
-        """What the velocity lacks to the wanted one [m/s]; the trim corrects a robot that walks."""
-        return self.wanted + (self.trim if self.wanted.any() else 0) - self.velocity
-
-    def trimmed(self, vx, dt):
-        """The trim after `dt` seconds: the integral of the error of the estimated speed `vx`.
-
-        It is bounded, waits while the command changes, and is zero while the robot stands.
-        """
-        m = self.meta.command
-        if not self.wanted.any():
-            return np.zeros(2)
-        steady = np.hypot(*self.way()) <= m.acceleration * dt + 1e-6
-        grown = self.trim[0] + m.trim_rate * dt * steady * (self.velocity[0] - self.trim[0] - vx)
-        return np.array([np.clip(grown, -m.trim, m.trim), 0])
 
     def frame(self, quat, angvel, joint_pos, joint_vel):
         """The observation frame of one control step.
@@ -119,14 +103,10 @@ class Controller:
         """
         m, gait = self.meta, self.meta.gait
         self.history = np.vstack([self.history[1:], self.frame(*measured)]).astype(np.float32)
-        found = [np.array(x)[0] for x in self.network.run(None, {"history": self.history[None]})]
-        action, *estimate = found  # a policy that trims its speed estimates it
+        action = np.array(self.network.run(["action"], {"history": self.history[None]})[0])[0]
         self.action = np.clip(action, -m.action_clip, m.action_clip) * self.free
         dt = dt or m.control_dt
-        vx = estimate[0][0] / m.command.velocity_scale if estimate else 0
-        trim = self.trimmed(vx, dt) if estimate else self.trim
         self.approach(dt)
-        self.trim = trim
         self.phase = (self.phase + dt / self.cycle(gait, abs(self.velocity[0]))) % 1
         return m.default_joint_pos + np.array(m.action_scale) * self.action
 

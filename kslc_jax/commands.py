@@ -16,12 +16,6 @@ TURNING = 0.1
 """Commanded yaw rate [rad/s] above which a robot with a zero velocity command must step."""
 
 
-TRIM_RATE = 0.5
-"""Growth of the trim [m/s^2] per error of the speed [m/s]. An error of 0.04 m/s is gone after some
-seconds, in which a robot takes several strides: the trim does not follow the swing of the speed
-within a stride."""
-
-
 @flax.struct.dataclass
 class Command:
     """Commanded velocity and heading of one robot."""
@@ -124,48 +118,15 @@ def steer(config: CommandConfig, command: Command, yaw: jax.Array, dt: float) ->
     return _approach(config, command.replace(turns=turns), rate, dt)
 
 
-def with_velocity(
-    config: CommandConfig, command: Command, velocity: jax.Array, trim: jax.Array | None = None
-) -> Command:
+def with_velocity(config: CommandConfig, command: Command, velocity: jax.Array) -> Command:
     """The command with the velocity [3] in place of its own; in the dead zone, vx and vy are zero.
 
     With `config.acceleration` only the yaw rate changes at once. vx and vy are then the wanted
-    ones, and `steer` approaches them. The new command may turn on the spot. A `trim` [] (m/s) is
-    added to the vx of a robot that walks, see `trimmed`.
+    ones, and `steer` approaches them. The new command may turn on the spot.
     """
-    planar = walking(config, velocity)
-    if trim is not None and config.trim > 0:
-        planar = planar.at[0].add(jnp.where(jnp.any(planar != 0.0), trim, 0.0))
-    fresh = command.replace(wanted=planar, turns=jnp.ones((), bool))
+    walks = maths.norm(velocity[:2]) > config.dead_zone
+    fresh = command.replace(wanted=velocity[:2] * walks, turns=jnp.ones((), bool))
     return _approach(config, fresh, velocity[2], 0.0)
-
-
-def walking(config: CommandConfig, velocity: jax.Array) -> jax.Array:
-    """vx and vy [2] of a commanded velocity [3] as they count: zero in the dead zone."""
-    return velocity[:2] * (maths.norm(velocity[:2]) > config.dead_zone)
-
-
-def trimmed(
-    config: CommandConfig, trim: jax.Array, command: Command, speed: jax.Array, dt: float
-) -> jax.Array:
-    """The trim [] (m/s) `dt` seconds later: the integral of the error of the speed.
-
-    A policy runs at nearly the commanded speed. The trim moves the command that it reads, until its
-    own estimate of the speed is the commanded one. It is bounded, waits while the command changes,
-    and is zero while the robot stands.
-
-    Args:
-      config: `config.trim` is its largest size.
-      trim: the present one.
-      command: that the robot reads; it contains the trim.
-      speed: [] m/s, estimated vx.
-      dt: time until the next call [s].
-    """
-    error = command.velocity[0] - trim - speed
-    left = maths.norm(command.wanted - command.velocity[:2])
-    steady = left <= config.acceleration * dt + 1e-6
-    grown = jnp.clip(trim + TRIM_RATE * dt * steady * error, -config.trim, config.trim)
-    return jnp.where(jnp.any(command.wanted != 0.0), grown, 0.0)
 
 
 def _approach(config: CommandConfig, command: Command, rate: jax.Array, dt: float) -> Command:

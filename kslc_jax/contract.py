@@ -7,7 +7,6 @@ finds the first difference.
 
 from __future__ import annotations
 
-import functools
 import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ from kslc_jax import __version__, files
 if TYPE_CHECKING:
     from kslc_jax.policy import Policy
 
-METADATA_VERSION = 6
+METADATA_VERSION = 5
 """Version of `metadata`; it grows when a name or its meaning changes."""
 
 TRACE_SECONDS = 10.0
@@ -111,9 +110,6 @@ def metadata(policy: Policy) -> dict[str, Any]:
         "command": {
             "dead_zone": config.command.dead_zone,
             "acceleration": config.command.acceleration,
-            "trim": config.command.trim if policy.trims else 0.0,
-            "trim_rate": commands.TRIM_RATE,
-            "velocity_scale": observations.VELOCITY_SCALE,
             "heading_gain": config.command.heading_gain,
             "max_yaw_rate": config.command.max_yaw_rate,
             "stand_still": config.command.stand_still,
@@ -145,7 +141,6 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     """Records R golden trials in the training's engine, each under one constant command.
 
     The robot starts in its home pose, without noise or delay. A trial ends when the robot falls.
-    The policy trims its speed.
 
     Returns:
       command [R, 3]: vx, vy [m/s], heading [rad, world]; phase [R]: of the gait clock, before the
@@ -160,15 +155,14 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
     from kslc_jax.evaluation import trials
 
     setting = trials.Setting(trials.engine(policy, "train"))  # on the flat floor
-    config = trials.without_joint_noise(trials.trial_config(policy.config, setting, len(SHARES)))
+    config = trials.trial_config(policy.config, setting, len(SHARES))
+    config = trials.without_joint_noise(config)
     robot = physics.robot_for(config.physics)
     home = jnp.asarray(robot.default_qpos[7:], jnp.float32)
     commands = _golden_commands(float(policy.curriculum.v_max))
 
-    def one(command: jax.Array, carry: tuple[env.EnvState, jax.Array, jax.Array], _: None):
-        state, alive, trim = carry
-        straight, heading = command.at[2].set(0.0), command[2]  # the heading decides the turn
-        state = trials.with_command(config, state, straight, heading, trim)
+    def one(carry: tuple[env.EnvState, jax.Array], _: None):
+        state, alive = carry
         before = state.physics
         key = jax.random.key(0)  # nothing is random
         new, out = env.step(config, state, policy.act_on(state.history), key, policy.curriculum)
@@ -182,15 +176,14 @@ def golden(policy: Policy, seconds: float = TRACE_SECONDS) -> dict[str, np.ndarr
             "action": new.last_action,
             "target": home + motors.action_scale(config.env, robot) * new.last_action,
         }
-        trim = policy.trimmed(trim, state.command, state.history)
-        return (new, alive, trim), jax.tree.map(lambda x: jnp.where(alive, x, jnp.nan), row)
+        return (new, alive), jax.tree.map(lambda x: jnp.where(alive, x, jnp.nan), row)
 
     def trial(command: jax.Array, key: jax.Array):
         state = env.reset(config, key, policy.curriculum)
         state = trials.facing_command(config, state, command)
         steps = round(seconds / config.control_dt)
-        begin = state, jnp.ones((), bool), jnp.zeros(())
-        _, rows = jax.lax.scan(functools.partial(one, command), begin, None, steps)
+        begin = state, jnp.ones((), bool)
+        _, rows = jax.lax.scan(one, begin, None, steps)
         return state.gait.phase, rows
 
     keys = jax.random.split(jax.random.key(0), len(SHARES))

@@ -143,14 +143,11 @@ def to_onnx(policy: Policy) -> bytes:
     """The network as ONNX, with `metadata` as JSON values.
 
     The graph is Flatten, then Gemm layers with Elu between them. An estimator comes first; Concat
-    appends its output to the flat history. For a policy that trims its speed the estimate,
-    `velocity`, is a second result.
+    appends its output to the flat history.
 
     Raises:
       ConfigError: the package onnx is missing.
     """
-    from kslc_jax import networks
-
     try:
         from onnx import TensorProto, checker, helper, numpy_helper
     except ImportError as error:
@@ -181,17 +178,17 @@ def to_onnx(policy: Policy) -> bytes:
         nodes.append(helper.make_node("Concat", ["flat", "velocity"], ["seen"], axis=1))
         seen = "seen"
     add("actor", seen, "action")
-    history = [floats("history", "batch", *policy.init().history.shape)]
-    results = [floats("action", "batch", len(policy.params["log_std"]))]
-    results += [floats("velocity", "batch", networks.ESTIMATED)] * policy.trims
+    history = floats("history", "batch", *policy.init().history.shape)
+    data = contract.metadata(policy)
+    action = floats("action", "batch", len(data["joint_names"]))
     model = helper.make_model(
-        helper.make_graph(nodes, "policy", history, results, weights),
+        helper.make_graph(nodes, "policy", [history], [action], weights),
         opset_imports=[helper.make_opsetid("", _OPSET)],
         ir_version=_IR_VERSION,
         producer_name="kslc_jax",
         producer_version=__version__,
     )
-    helper.set_model_props(model, {k: json.dumps(v) for k, v in contract.metadata(policy).items()})
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in data.items()})
     checker.check_model(model, full_check=True)
     return model.SerializeToString()
 
@@ -210,24 +207,14 @@ def read_onnx(path: Path) -> Network:
 
 
 def to_stablehlo(policy: Policy) -> bytes:
-    """The network, serialised by `jax.export` for CPU, CUDA and TPU, for any batch size.
-
-    For a policy that trims its speed the result is (action, estimated velocity).
-    """
+    """The network, serialised by `jax.export` for CPU, CUDA and TPU, for any batch size."""
     import jax
     import jax.export
     import jax.numpy as jnp
 
-    from kslc_jax import networks
-
-    def both(history: jax.Array):
-        estimate = networks.estimate(policy.config, policy.params, history)
-        return policy.act_on(history), estimate
-
     (batch,) = jax.export.symbolic_shape("batch")
     shape = (batch, *policy.init().history.shape)
-    network = jax.jit(jax.vmap(both if policy.trims else policy.act_on))
-    export = jax.export.export(network, platforms=("cpu", "cuda", "tpu"))
+    export = jax.export.export(jax.jit(jax.vmap(policy.act_on)), platforms=("cpu", "cuda", "tpu"))
     with _without_folders():
         return bytes(export(jax.ShapeDtypeStruct(shape, jnp.float32)).serialize())
 
@@ -251,7 +238,7 @@ def read_stablehlo(path: Path) -> Network:
     import jax.export
 
     exported = jax.export.deserialize(bytearray(path.read_bytes()))
-    return lambda histories: np.asarray(jax.tree.leaves(exported.call(histories))[0])
+    return lambda histories: np.asarray(exported.call(histories))
 
 
 # ------------------------------------------------------------------------------------------ orbax

@@ -30,9 +30,6 @@ _SIGNS = {"polar": POLAR, "axial": (-1, 1, -1), "command": (1, -1, -1)}
 MASS_SCALE = 30.0
 """Mass [kg] of XBot-L's trunk that the critic sees as 1. It scales with the mass of a robot."""
 
-VELOCITY_SCALE = 2.0
-"""Scale of the base's velocity in the critic's frame, and so of the estimated velocity."""
-
 
 @dataclass(frozen=True)
 class Component:
@@ -93,7 +90,7 @@ def critic_table(robot: Robot, memory: bool = False) -> Table:
         Component("joint_vel", n, 0.05, 0.0, "joints"),
         Component("last_action", n, 1.0, 0.0, "joints"),
         Component("tracking_difference", n, 1.0, 0.0, "joints"),
-        Component("base_linvel", 3, VELOCITY_SCALE, 0.0, "polar"),
+        Component("base_linvel", 3, 2.0, 0.0, "polar"),
         Component("base_angvel", 3, 1.0, 0.0, "axial"),
         Component("base_euler", 3, 1.0, 0.0, "axial"),
         Component("push_linear", 2, 1.0, 0.0, "polar"),

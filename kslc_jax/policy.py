@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from kslc_jax import commands, files, networks, observations
 from kslc_jax import config as config_lib
 from kslc_jax import curriculum as curriculum_lib
+from kslc_jax import files, networks, observations
 from kslc_jax import robot as robot_lib
 from kslc_jax.checkpoint_format import (
     ROBOT_NUMBERS,
@@ -29,7 +29,6 @@ from kslc_jax.checkpoint_format import (
     require_checksum,
     whole_checkpoints,
 )
-from kslc_jax.commands import Command
 from kslc_jax.config import Config
 from kslc_jax.curriculum import Curriculum
 from kslc_jax.fingerprint import Fingerprint
@@ -69,22 +68,6 @@ class Policy:
     def act_on(self, history: jax.Array) -> jax.Array:
         """Deterministic action [n] for a whole history [K, W]."""
         return networks.policy(self.config, self.params, history).mean
-
-    @property
-    def trims(self) -> bool:
-        """True if the policy corrects the vx that it is told, see `commands.trimmed`."""
-        return self.config.command.trim > 0 and bool(self.config.network.estimator)
-
-    def trimmed(self, trim: jax.Array, command: Command, history: jax.Array) -> jax.Array:
-        """The trim [] (m/s) after the control step for which the robot reads `command`.
-
-        `history` [K, W] is that of `act_on`.
-        """
-        velocity = networks.estimate(self.config, self.params, history)
-        if velocity is None or not self.trims:
-            return trim
-        speed = velocity[0] / observations.VELOCITY_SCALE
-        return commands.trimmed(self.config.command, trim, command, speed, self.config.control_dt)
 
 
 def load_policy(path_or_name: str | Path) -> Policy:

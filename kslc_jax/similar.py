@@ -72,7 +72,6 @@ def factors(robot: Robot) -> dict[str, float]:
     return {
         "command.vy": time,
         "command.dead_zone": time,
-        "command.trim": time,
         "command.slow_speed": time,
         "command.narrow_speed": time,
         "gait.cycle_time": time,

@@ -1,7 +1,6 @@
 """Commands: dead zone, heading, narrowing, standing still, and shares of slow commands."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -188,34 +187,6 @@ def test_the_command_approaches_the_wanted_one():
         assert bool(command.moving), step
         command = steer(command)
     assert not bool(command.moving) and not command.velocity.any()
-
-
-def test_the_trim_by_hand():
-    """A robot that makes 0.9 at 1.0 m/s: 0.5/s of the error of 0.1 m/s, for 0.01 s a step, up to
-    0.04 m/s. At 0.98 m/s, 0.02 too slow in spite of the trim, it grows by a fifth of that."""
-    config = dataclasses.replace(PAPER, acceleration=2.0, stand_still=True, trim=0.04)
-    f = jax.jit(functools.partial(commands.trimmed, config), static_argnums=3)
-
-    def asked(vx, trim, now=None):
-        """The command of vx in a robot whose command has reached `now` (None: all of it)."""
-        start = make_command(velocity=[now or 0.0, 0.0, 0.0], moving=True)
-        told = commands.with_velocity(config, start, jnp.array([vx, 0.0, 0.0]), jnp.asarray(trim))
-        return told if now else told.replace(velocity=jnp.append(told.wanted, 0.0))
-
-    def grown(vx, trim, speed, now=None):
-        return float(f(jnp.asarray(trim), asked(vx, trim, now), jnp.asarray(speed), DT))
-
-    np.testing.assert_allclose(asked(1.0, 0.03).wanted, [1.03, 0.0], rtol=1e-6)
-    assert grown(1.0, 0.0, 0.9) == pytest.approx(0.0005, rel=1e-4)
-    assert grown(1.0, 0.03, 0.98) == pytest.approx(0.03 + 0.0001, rel=1e-4)
-    assert grown(1.0, 0.0399, 0.5) == pytest.approx(0.04)
-    assert grown(-0.3, -0.04, 0.0) == pytest.approx(-0.04)
-    # It waits while the command moves by more than 0.02 m/s, and is zero at rest.
-    assert grown(1.0, 0.03, 0.5, now=1.0) == pytest.approx(0.03)
-    assert grown(1.0, 0.03, 0.5, now=1.02) == pytest.approx(0.03 + 0.00245)
-    assert grown(0.0, 0.03, 0.1) == grown(0.19, 0.03, 0.1) == 0.0
-    assert not asked(0.19, 0.03).wanted.any()  # a trim does not lift a command out of the dead zone
-    np.testing.assert_allclose(asked(0.21, -0.03).wanted, [0.18, 0.0], rtol=1e-6)
 
 
 def test_a_new_command_starts_from_the_one_before():

@@ -140,16 +140,6 @@ def test_onnxruntime_gets_the_processors_that_are_allowed(onnx_file, monkeypatch
     assert seen[0].get_session_options().intra_op_num_threads == 3
 
 
-def test_a_policy_that_trims_its_speed_exports_the_estimate(symmetric, tmp_path):
-    assert symmetric.trims
-    seen = histories(symmetric)
-    wanted = networks.estimate(symmetric.config, symmetric.params, seen)
-    graph = onnxruntime.InferenceSession(export.to_onnx(symmetric))
-    np.testing.assert_allclose(graph.run(["velocity"], {"history": seen})[0], wanted, atol=2e-6)
-    read = jax.export.deserialize(bytearray(export.to_stablehlo(symmetric)))
-    np.testing.assert_allclose(read.call(seen)[1], wanted, atol=2e-6)
-
-
 def test_the_symmetric_actor_as_a_plain_mlp_mirrors(symmetric, tmp_path):
     path = tmp_path / "policy.onnx"
     path.write_bytes(export.to_onnx(symmetric))
@@ -166,19 +156,17 @@ def test_the_graph_estimates_the_velocity_and_then_acts(policy, onnx_file):
     estimator = ["Gemm", "Elu", "Gemm", "Concat"] if policy.config.network.estimator else []
     actor = ["Gemm", "Elu"] * 2 + ["Gemm"]
     assert [n.op_type for n in model.graph.node] == ["Flatten", *estimator, *actor]
-    shapes = {
-        x.name: [d.dim_param or d.dim_value for d in x.type.tensor_type.shape.dim]
-        for x in (*model.graph.input, *model.graph.output)
-    }
-    velocity = {"velocity": ["batch", 3]} if policy.trims else {}
-    assert shapes == {"history": ["batch", 3, 59], "action": ["batch", 16], **velocity}
+    (history,), (action,) = model.graph.input, model.graph.output
+    dims = [d.dim_param or d.dim_value for d in history.type.tensor_type.shape.dim]
+    assert dims == ["batch", 3, 59]
+    assert [d.dim_param or d.dim_value for d in action.type.tensor_type.shape.dim] == ["batch", 16]
     assert model.opset_import[0].version == 17 and model.ir_version == 8
 
 
 def test_metadata(symmetric, xbot):
     """The numbers are typed by hand where the paper or Humanoid-Gym gives them."""
     data = contract.metadata(symmetric)
-    assert data["metadata_version"] == 6 and data["train_step"] == 7
+    assert data["metadata_version"] == 5 and data["train_step"] == 7
     assert tuple(data["joint_names"]) == xbot.joint_names
     assert data["kp"][:6] == [200, 200, 350, 350, 15, 15] and data["kd"] == [10] * 16
     assert data["effort_limit"][3] == 212.5
@@ -198,10 +186,6 @@ def test_metadata(symmetric, xbot):
         "speed_step": 0.5,
     }
     assert data["command"]["stand_still"] and data["command"]["dead_zone"] == 0.2
-    assert [data["command"][name] for name in ("trim", "trim_rate", "velocity_scale")] == [
-        *(0.04, 0.5, 2.0)
-    ]
-    assert contract.metadata(make_policy("plain"))["command"]["trim"] == 0.0
     assert data["held_joints"] == []
 
 
@@ -366,13 +350,11 @@ def trajectory(policy):
 
 
 def controller_of(runner, path, states, i):
-    """A controller of the runner with command and phase of the start of environment `i`. It does
-    not trim its speed, as training does not."""
+    """A controller of the runner with command and phase of the start of environment `i`."""
     command = states.command
     vx, vy = command.wanted[0, i].tolist()
     controller = runner.Controller(path, vx, vy, command.heading[0, i])
     controller.phase = float(states.gait.phase[0, i])
-    controller.meta.command.trim = 0.0
     return controller
 
 
@@ -429,20 +411,6 @@ def test_a_golden_trace_is_what_its_policy_does(acting, contracted):
 
 def test_the_runner_follows_the_golden_trace(runner, checker, contracted):
     assert checker.first_difference(runner.Controller, contracted, 1e-4) is None
-
-
-def test_the_runner_trims_its_speed(runner, checker, acting, contracted):
-    """A random policy does not run 1.0 m/s. So half a second after the command has arrived, the
-    trim has reached its bound; without it the runner's targets are wrong."""
-    told = np.load(contracted.with_suffix(".npz"))["frame"][2, :, 2] / 2.0
-    assert np.abs(told[-1] - 1.0) == pytest.approx(0.04 * acting.trims, abs=1e-6)
-
-    class Untrimmed(runner.Controller):
-        def trimmed(self, vx, dt):
-            return np.zeros(2)
-
-    assert checker.first_difference(runner.Controller, contracted, 1e-6) is None
-    assert (checker.first_difference(Untrimmed, contracted, 1e-5) is None) != acting.trims
 
 
 def test_the_data_name_the_robot_and_the_other_files(acting, checker, contracted, tmp_path):

@@ -76,27 +76,6 @@ def test_commands_hold(still):
             np.testing.assert_allclose(seen[2], wanted[2], atol=0.01)  # one step turns the robot
 
 
-@pytest.mark.parametrize("trim", [0.04, 0.0])
-def test_a_robot_that_stands_still_at_a_command_trims_its_speed(still, trim):
-    """It is told up to 0.04 m/s more, if its estimate stays below the command. The trace has the
-    command of the user."""
-    config = dataclasses.replace(
-        still.config, command=dataclasses.replace(still.config.command, trim=trim)
-    )
-    params = jax.tree.map(jnp.zeros_like, still.params)  # estimates 0
-    policy = dataclasses.replace(still, config=config, params=params)
-    setting = trials.Setting(C_MUJOCO, seconds=1.0)
-    velocities = np.array([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0], [-0.3, 0.1, 0.0]])
-    start, key = trials._begin(policy, setting, velocities, 0)
-    _, advance = trials._programs(config, trials._compiled(setting), 3, env.step)
-    keys = jax.random.split(key, 100)
-    end, trace = advance(policy.params, policy.curriculum, start, keys)
-    np.testing.assert_allclose(end.trim, [trim, 0.0, -trim], atol=1e-6)
-    told = end.env.history[:, -1, observations.slices(ACTOR)["command"]][:, :2] / 2.0
-    np.testing.assert_allclose(told, velocities[:, :2] + [[trim, 0], [0, 0], [-trim, 0]], atol=1e-6)
-    np.testing.assert_allclose(trace.command[-1, :, :2], velocities[:, :2], atol=1e-6)
-
-
 @pytest.mark.parametrize("rate", [0.3, 3.0, -3.0])
 def test_a_yaw_rate_never_turns_the_other_way(still, rate):
     """A rate of 3 rad/s would ask for a heading 6 rad ahead, which is 0.28 rad behind."""

@@ -14,7 +14,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 import orbax.checkpoint as ocp
@@ -214,21 +213,6 @@ def test_a_standing_robot_does_not_turn_back_and_forth(still):
     leg = live._memory.leg
     live._memory = live._memory.replace(leg=leg.replace(heading=leg.heading + 0.01))
     assert steps(0.5, stand)
-
-
-def test_a_session_trims_its_speed(still):
-    """A robot that does not move estimates a speed of 0. At 0.5 m/s it is told 0.04 m/s more after
-    a second; a new episode begins without a trim."""
-    zeros = jax.tree.map(jnp.zeros_like, still.params)
-    live = session.Session(dataclasses.replace(still, params=zeros), C_MUJOCO)
-    assert still.trims
-    for _ in range(100):
-        live.advance(np.array([0.5, 0.0, 0.0]))
-    assert float(live._memory.trim) == pytest.approx(0.04)
-    assert float(live._memory.env.command.velocity[0]) == pytest.approx(0.54)
-    assert live.view.command[0] == 0.5
-    live.reset()
-    assert float(live._memory.trim) == 0.0
 
 
 def test_a_joystick_that_trembles_at_the_edge_of_the_dead_zone():

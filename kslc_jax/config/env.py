@@ -77,9 +77,6 @@ class CommandConfig:
     acceleration: float = 0.0
     """Largest change of the commanded vx and vy [m/s^2]. The command that the robot gets approaches
     the wanted one at this rate: no robot can stop at once. 0: it jumps (HG)."""
-    trim: float = 0.0
-    """Largest correction of the commanded vx [m/s], by the policy's own estimate of its speed, see
-    `commands.trimmed`. Training has none. 0, or a policy without `network.estimator`: none."""
     heading_gain: float = 0.5
     """Commanded yaw rate per heading error [1/s] (HG)."""
     max_yaw_rate: float = 1.0
@@ -122,7 +119,6 @@ class CommandConfig:
         )
         require(self.slow_speed > 0, "command.slow_speed must be positive")
         require(self.acceleration >= 0, "command.acceleration must not be negative")
-        require(self.trim >= 0, "command.trim must not be negative")
         require(0 <= self.brake_fraction <= 1, "command.brake_fraction must lie in [0, 1]")
         require(
             0 <= self.shortest_seconds <= self.resample_seconds,

@@ -60,7 +60,6 @@ _LAPTOP = _override(
     command={
         "shortest_seconds": 1.0,
         "acceleration": 2.0,
-        "trim": 0.04,
         "stand_fraction": 0.15,
         "forward_fraction": 0.2,
         "slow_fraction": 0.15,

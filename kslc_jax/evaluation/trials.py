@@ -102,7 +102,6 @@ class Trial:
     alive: jax.Array  # [] bool
     queue: jax.Array  # [latency, n] delayed actions, the next one first
     leg: Leg
-    trim: jax.Array  # [] m/s, see commands.trimmed
     body: Body
     key: jax.Array  # random key of this robot
 
@@ -192,11 +191,7 @@ def facing_command(config: Config, state: env.EnvState, command: jax.Array) -> e
 
 
 def with_command(
-    config: Config,
-    state: env.EnvState,
-    velocity: jax.Array,
-    heading: jax.Array | float = 0.0,
-    trim: jax.Array | None = None,
+    config: Config, state: env.EnvState, velocity: jax.Array, heading: jax.Array | float = 0.0
 ) -> env.EnvState:
     """Gives the environment the command `velocity` [3]: vx, vy [m/s], yaw rate [rad/s].
 
@@ -206,14 +201,12 @@ def with_command(
 
     While a command holds, a turn on the spot that has ended does not begin again, as in training
     (`commands.steer`). Else a standing robot near the smallest such turn would step and stop again
-    and again. `trim` [] (m/s) corrects vx, see `commands.trimmed`.
+    and again.
     """
     yaw = signals.read(physics.robot_for(config.physics), state.physics).base_euler[2]
     ahead = yaw + jnp.clip(velocity[2] / config.command.heading_gain, -FARTHEST, FARTHEST)
     heading = jnp.where(velocity[2] == 0.0, heading, ahead)
-    before = state.command
-    now = commands.with_velocity(config.command, before, velocity, trim)
-    # Only a robot that stands turns on the spot, and it has no trim.
+    before, now = state.command, commands.with_velocity(config.command, state.command, velocity)
     held = (heading == before.heading) & jnp.all(now.wanted == before.wanted)
     turns = jnp.where(held, before.turns, now.turns)
     return state.replace(command=now.replace(heading=heading, turns=turns))
@@ -305,7 +298,6 @@ def _start(
         alive=jnp.ones((), bool),
         queue=jnp.zeros((setting.latency, len(state.last_action))),
         leg=leg,
-        trim=jnp.zeros(()),
         body=variation.sample(setting.variation, robot, key_body),
         key=own,
     )
@@ -333,9 +325,9 @@ def _advance(
         qpos = trial.env.physics.qpos
         yaw = maths.quat_to_euler(qpos[3:7])[2]
         leg = schedules.update(setting.schedule, config.command, leg, trial.key, yaw, qpos[:2], dt)
-    state = with_command(config, trial.env, leg.velocity, leg.heading, trial.trim)
-    seen = state.history + _frame_error(setting, robot)
-    queue = jnp.concatenate([trial.queue, policy.act_on(seen)[None]])
+    state = with_command(config, trial.env, leg.velocity, leg.heading)
+    action = policy.act_on(state.history + _frame_error(setting, robot))
+    queue = jnp.concatenate([trial.queue, action[None]])
     simulate = _simulator(setting, robot, trial.body, key)
     after, outcome = step(config, state, queue[0], key, policy.curriculum, simulate=simulate)
     trial = trial.replace(
@@ -343,12 +335,10 @@ def _advance(
         alive=trial.alive & ~outcome.terminated,
         queue=queue[1:],
         leg=leg,
-        trim=policy.trimmed(trial.trim, state.command, seen),
     )
     mass = randomize.total_mass(robot, after.dynamics)
     mass += len(robot.hand_body_ids) * setting.variation.hands
-    wanted = commands.walking(config.command, leg.velocity)
-    wanted = jnp.append(wanted, state.command.velocity[2])
+    wanted = jnp.append(state.command.wanted, state.command.velocity[2])
     return trial, _record(robot, trial, wanted, mass)
 
 

@@ -82,7 +82,6 @@ class Memory:
 
     env: env.EnvState
     leg: Leg  # the present command
-    trim: jax.Array  # [] m/s, see commands.trimmed
     key: jax.Array  # random key of the schedule, another one in each episode
 
 
@@ -98,8 +97,7 @@ class Asked:
 @functools.partial(jax.jit, static_argnums=0)
 def _reset(config: Config, curriculum: Curriculum, key: jax.Array) -> tuple[Memory, View]:
     state = env.reset(config, key, curriculum)
-    key_memory = jax.random.fold_in(key, 1)
-    memory = Memory(state, schedules.before_start(0.0), jnp.zeros(()), key_memory)
+    memory = Memory(state, schedules.before_start(0.0), jax.random.fold_in(key, 1))
     return memory, _view(config, state, jnp.zeros(3), jnp.zeros((), bool))
 
 
@@ -115,9 +113,9 @@ def _advance(
     count: jax.Array,
 ) -> tuple[Memory, View]:
     """One control step. After a fall the view shows the state before the step."""
-    leg, policy = _next_leg(config, schedule, memory, asked), Policy(config, params, curriculum, 0)
-    before = trials.with_command(config, memory.env, leg.velocity, leg.heading, memory.trim)
-    action = policy.act_on(before.history)
+    leg = _next_leg(config, schedule, memory, asked)
+    before = trials.with_command(config, memory.env, leg.velocity, leg.heading)
+    action = Policy(config, params, curriculum, 0).act_on(before.history)
     key_step = jax.random.fold_in(key, count)
     simulate = functools.partial(_simulate, asked.force)
     after, outcome = env.step(config, before, action, key_step, curriculum, simulate)
@@ -125,10 +123,8 @@ def _advance(
     view = _view(config, maths.tree_where(fallen, before, after), leg.velocity, fallen)
     yaw = signals.read(physics.robot_for(config.physics), after.physics).base_euler[2]
     leg = leg.replace(heading=jnp.where(leg.velocity[2] == 0.0, leg.heading, yaw))
-    trim = policy.trimmed(memory.trim, before.command, before.history)
-    key_again = jax.random.fold_in(memory.key, count)
-    again = Memory(after, schedules.before_start(0.0), jnp.zeros(()), key_again)
-    return maths.tree_where(fallen, again, Memory(after, leg, trim, memory.key)), view
+    again = Memory(after, schedules.before_start(0.0), jax.random.fold_in(memory.key, count))
+    return maths.tree_where(fallen, again, Memory(after, leg, memory.key)), view
 
 
 def _next_leg(config: Config, schedule: Schedule | None, memory: Memory, asked: Asked) -> Leg:
