@@ -23,6 +23,7 @@ from rich.text import Text
 from kslc_jax import compare, judge, records
 from kslc_jax.config.physics import XBOT_L
 from kslc_jax.evaluation import scheduled, tables
+from kslc_jax.evaluation.bars import REPORTED
 
 ROOT = Path(__file__).parents[1]
 
@@ -181,7 +182,7 @@ def _only(path: Path) -> list[Row]:
 
 
 def _wanted(part: dict[str, Any]) -> str:
-    return f"wanted {part['wanted']:.0%}" if part["wanted"] else "no bar"
+    return f"wanted {part['wanted']:.0%}" if part["wanted"] else REPORTED
 
 
 def _by_speed(corner: str, found: dict[str, list[Row]]) -> Table:
